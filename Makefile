@@ -1,0 +1,36 @@
+# Each target sets up what it needs in a local environment; only Python itself must be there.
+PYTHON ?= python3
+BIN := .venv/bin
+INSTALLED := .venv/.installed
+TOO_OLD := "sb3_esad needs Python 3.10 or newer, $(PYTHON) is %d.%d; choose another with make PYTHON=python3.11"
+
+.PHONY: demo test lint type format benchmark
+
+# Train briefly, evaluate and print the metrics.
+demo: $(INSTALLED)
+	$(BIN)/python -m sb3_esad demo
+
+# Two workers, for the tests are many and small; tests/conftest.py gives each of them one thread.
+test: $(INSTALLED)
+	$(BIN)/python -m pytest -n 2 -m "not slow"
+
+lint: $(INSTALLED)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+type: $(INSTALLED)
+	$(BIN)/mypy
+
+format: $(INSTALLED)
+	$(BIN)/ruff check --fix .
+	$(BIN)/ruff format .
+
+# The tables and figures of the paper.
+benchmark: $(INSTALLED)
+	$(BIN)/python -m sb3_esad benchmark
+
+$(INSTALLED): setup.cfg constraints.txt
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'
+	$(PYTHON) -m venv .venv
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[tests]"
+	@touch $@

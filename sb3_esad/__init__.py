@@ -1,0 +1,1 @@
+"""Safe model-based reinforcement learning for Stable-Baselines3."""

@@ -1,0 +1,1 @@
+"""What the algorithms share: data, mathematics, networks, multipliers."""

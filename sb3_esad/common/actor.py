@@ -1,0 +1,55 @@
+"""The actor: a squashed Gaussian over actions given the latent state."""
+
+import torch as th
+from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from torch import nn
+
+from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
+from sb3_esad.common.type_aliases import LatentState
+
+LOG_STD_MIN, LOG_STD_MAX = -3.0, 1.0
+
+
+class Actor(nn.Module):
+    """
+    Policy on latent states, in actions scaled to [-1, 1].
+
+    :param grid_shape: shape of the latent grid (C, H, W)
+    :param action_dim: length of the action
+    :param net_arch: hidden layers; the first entry is the length of the readout too
+    """
+
+    optimizer: th.optim.Optimizer
+
+    def __init__(self, grid_shape: GridShape, action_dim: int, net_arch: list[int]) -> None:
+        super().__init__()
+        self.action_dim = action_dim
+        self.readout = GridReadout(grid_shape, net_arch[0])
+        self.parameters_net = mlp(net_arch[0], net_arch[1:], 2 * action_dim, zero_output=True)
+
+    def forward(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
+        """
+        Choose actions.
+
+        :param state: N states
+        :param deterministic: take the mode instead of a sample
+        :return: shape (N, A)
+        """
+        return self._distribution().actions_from_params(*self._parameters(state), deterministic=deterministic)
+
+    def action_log_prob(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+        """
+        Draw reparameterised actions.
+
+        :param state: N states
+        :return: actions of shape (N, A), and their log-density of shape (N,)
+        """
+        return self._distribution().log_prob_from_params(*self._parameters(state))
+
+    def _distribution(self) -> SquashedDiagGaussianDistribution:
+        return SquashedDiagGaussianDistribution(self.action_dim)
+
+    def _parameters(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+        mean, spread = self.parameters_net(self.readout(state.grid)).float().chunk(2, dim=1)
+        # Smooth bounds keep a gradient where a clamp would have none
+        return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (th.tanh(spread) + 1)

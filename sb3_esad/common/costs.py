@@ -1,0 +1,113 @@
+"""Costs reach the algorithms through the info dict of the environment, and only here."""
+
+import warnings
+from typing import Any, NamedTuple
+
+import numpy as np
+
+
+class CostReader:
+    """
+    Reads the cost of a step from the info dicts of all environments.
+
+    A missing cost counts as zero, with one warning for each reader.
+
+    :param cost_key: key of the cost in the info dict; its value is a bool or a finite number >= 0
+    """
+
+    def __init__(self, cost_key: str = "cost") -> None:
+        self.cost_key = cost_key
+        self._warned = False
+
+    def __call__(self, infos: list[dict[str, Any]]) -> np.ndarray:
+        """
+        Read one cost for each environment.
+
+        :param infos: info dicts of one step, one for each environment
+        :return: (n_envs,) float32
+        :raises ValueError: if a cost is not one finite number >= 0
+        """
+        return np.array([self._read(info) for info in infos], dtype=np.float32)
+
+    def _read(self, info: dict[str, Any]) -> float:
+        if self.cost_key not in info:
+            self._warn_missing(info)
+            return 0.0
+        cost = np.asarray(info[self.cost_key])
+        if cost.ndim > 0 or cost.dtype.kind not in "biuf" or not np.isfinite(cost) or cost < 0:
+            raise ValueError(
+                f'info["{self.cost_key}"] is {info[self.cost_key]!r}; a cost must be one finite number >= 0 or a bool.'
+            )
+        return float(cost)
+
+    def _warn_missing(self, info: dict[str, Any]) -> None:
+        if self._warned:
+            return
+        self._warned = True
+        hint = ' There is a "crashed": pass cost_key="crashed" to use it.' if "crashed" in info else ""
+        warnings.warn(f'No cost: the info dict has no "{self.cost_key}", so the cost counts as 0.{hint}', stacklevel=2)
+
+
+def read_costs(infos: list[dict[str, Any]], cost_key: str = "cost") -> np.ndarray:
+    """
+    Read the costs of one step; use a :class:`CostReader` to be warned only once.
+
+    :param infos: info dicts of one step, one for each environment
+    :param cost_key: key of the cost in the info dict
+    :return: (n_envs,) float32, 0 where the key is missing
+    :raises ValueError: if a cost is not one finite number >= 0
+    """
+    return CostReader(cost_key)(infos)
+
+
+class FinishedEpisode(NamedTuple):
+    """
+    What an episode has cost.
+
+    :param env: index of its environment
+    :param cost: undiscounted sum
+    :param discounted_cost: discounted sum, as seen from the first step
+    :param length: in steps
+    """
+
+    env: int
+    cost: float
+    discounted_cost: float
+    length: int
+
+
+class EpisodeCosts:
+    """
+    Running sums of the episodes under way.
+
+    :param discount: of the discounted sums
+    """
+
+    def __init__(self, discount: float = 1.0) -> None:
+        self.discount = discount
+        self._start(0)
+
+    def _start(self, n_envs: int) -> None:
+        self._costs = np.zeros(n_envs)
+        self._discounted = np.zeros(n_envs)
+        self._lengths = np.zeros(n_envs, dtype=np.int64)
+
+    def add(self, costs: np.ndarray, dones: np.ndarray) -> list[FinishedEpisode]:
+        """
+        Add one step of all environments; another number of environments than before starts afresh.
+
+        :param costs: (n_envs,)
+        :param dones: (n_envs,) bool, the step was the last of its episode
+        :return: the episodes that ended with this step
+        """
+        if len(costs) != len(self._costs):
+            self._start(len(costs))
+        self._costs += costs
+        self._discounted += self.discount**self._lengths * costs
+        self._lengths += 1
+        return [self._finish(int(env)) for env in np.flatnonzero(dones)]
+
+    def _finish(self, env: int) -> FinishedEpisode:
+        episode = FinishedEpisode(env, float(self._costs[env]), float(self._discounted[env]), int(self._lengths[env]))
+        self._costs[env] = self._discounted[env] = self._lengths[env] = 0
+        return episode

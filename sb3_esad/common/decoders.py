@@ -1,0 +1,111 @@
+"""What a latent state looks like: reconstructions of images and vectors, and how wrong they are."""
+
+import math
+
+import torch as th
+from torch import nn
+
+from sb3_esad.common.functional import symexp, symlog
+from sb3_esad.common.torch_layers import GridReadout, GridShape, conv_block
+
+FOREGROUND_CONTRAST = 0.1
+MEDIAN_SAMPLE = 32
+
+
+class ImageHead(nn.Module):
+    """
+    Reconstruct an image, with more weight on the pixels that differ from the usual background.
+
+    Squared errors are taken on patches of 4x4 pixels, as the network puts them out: to sort the pixels of a batch costs more
+    than a layer.
+
+    :param grid_shape: shape of the latent grid (C, H, W), one cell for 8x8 pixels
+    :param image_shape: shape of the image (C, H, W)
+    :param foreground_weight: additional weight of a pixel that differs from its running median by more than 0.1
+    :param channels: channels of the hidden layers
+    """
+
+    background: th.Tensor
+
+    def __init__(
+        self, grid_shape: GridShape, image_shape: tuple[int, ...], foreground_weight: float, channels: int = 32
+    ) -> None:
+        super().__init__()
+        self.image_shape = image_shape
+        self.foreground_weight = foreground_weight
+        self.cells = (math.ceil(image_shape[1] / 8), math.ceil(image_shape[2] / 8))
+        self.layers = nn.Sequential(
+            conv_block(grid_shape[0], 4 * channels, 3), nn.PixelShuffle(2), conv_block(channels, channels, 3)
+        )
+        self.pixels = nn.Linear(channels, 16 * image_shape[0])
+        self.register_buffer("background", th.zeros(2 * self.cells[0], 2 * self.cells[1], 16 * image_shape[0]))
+
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Reconstruct images.
+
+        :param grid: latent states, of shape (N, C, H, W)
+        :return: images scaled as SB3's preprocessing leaves them, of shape (N, *image_shape)
+        """
+        _, height, width = self.image_shape
+        return nn.functional.pixel_shuffle(self._patches(grid).movedim(-1, 1), 4)[..., :height, :width]
+
+    def loss(self, grid: th.Tensor, images: th.Tensor) -> th.Tensor:
+        """
+        Sum the weighted squared error over pixels, average it over the batch.
+
+        :param grid: latent states, of shape (N, C, H, W)
+        :param images: preprocessed images, of shape (N, *image_shape)
+        :return: scalar
+        """
+        _, height, width = self.image_shape
+        padded = nn.functional.pad(images, (0, -width % 8, 0, -height % 8))
+        patches = nn.functional.pixel_unshuffle(padded, 4).movedim(1, -1).contiguous()
+        self._follow_median(patches[:: math.ceil(len(patches) / MEDIAN_SAMPLE)])
+        foreground = (patches - self.background.to(patches.dtype)).abs() > FOREGROUND_CONTRAST
+        weights = 1 + self.foreground_weight * foreground.to(patches.dtype)
+        return (weights * (self._patches(grid) - patches).square()).sum(dtype=th.float32) / len(images)
+
+    def _patches(self, grid: th.Tensor) -> th.Tensor:
+        """Patches of 4x4 pixels, of shape (N, rows, columns, 16 * channels)."""
+        if grid.shape[-2:] != self.cells:
+            grid = nn.functional.interpolate(grid, self.cells)
+        return self.pixels(self.layers(grid).movedim(1, -1))
+
+    @th.no_grad()
+    def _follow_median(self, patches: th.Tensor, rate: float = 0.02) -> None:
+        # Its fixed point has as many values above as below, and it needs no memory of past images
+        self.background += rate * (patches - self.background).sign().mean(0)
+
+
+class VectorHead(nn.Module):
+    """
+    Reconstruct a flat observation as its symmetric logarithm.
+
+    :param grid_shape: shape of the latent grid (C, H, W)
+    :param size: length of the observation after SB3's preprocessing
+    :param units: units of the hidden layer
+    """
+
+    def __init__(self, grid_shape: GridShape, size: int, units: int = 256) -> None:
+        super().__init__()
+        self.layers = nn.Sequential(GridReadout(grid_shape, units), nn.Linear(units, size))
+
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Reconstruct vectors.
+
+        :param grid: latent states, of shape (N, C, H, W)
+        :return: preprocessed observations, of shape (N, size)
+        """
+        return symexp(self.layers(grid))
+
+    def loss(self, grid: th.Tensor, vectors: th.Tensor) -> th.Tensor:
+        """
+        Sum the squared error over entries, average it over the batch.
+
+        :param grid: latent states, of shape (N, C, H, W)
+        :param vectors: preprocessed observations, of shape (N, ...)
+        :return: scalar
+        """
+        return (self.layers(grid).float() - symlog(vectors.flatten(1))).square().sum(1).mean()

@@ -1,0 +1,105 @@
+"""What the latest training episodes have cost, beside what was predicted."""
+
+import math
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_esad.common.costs import EpisodeCosts, FinishedEpisode
+
+
+class EpisodeRecord(nn.Module):
+    """
+    Ring of the latest episodes; it is part of the saved model, hence made of float buffers.
+
+    :param cost_gamma: discount of the costs
+    :param episode_length: in steps, assumed until cost-free episodes have been seen
+    :param window: number of episodes remembered
+    """
+
+    costs: th.Tensor
+    discounted_costs: th.Tensor
+    n_episodes: th.Tensor
+    mean_length: th.Tensor
+    prediction_sum: th.Tensor
+    prediction_weight: th.Tensor
+
+    prediction_decay = 0.99
+
+    def __init__(self, cost_gamma: float, episode_length: float, window: int) -> None:
+        super().__init__()
+        self.window = window
+        self._under_way = EpisodeCosts(cost_gamma)  # not saved: another number of environments may follow
+        self.register_buffer("costs", th.zeros(window))
+        self.register_buffer("discounted_costs", th.zeros(window))
+        self.register_buffer("n_episodes", th.zeros(()))
+        self.register_buffer("mean_length", th.tensor(float(episode_length)))
+        self.register_buffer("prediction_sum", th.zeros(()))
+        self.register_buffer("prediction_weight", th.zeros(()))
+
+    @property
+    def size(self) -> int:
+        """Number of episodes remembered."""
+        return min(int(self.n_episodes), self.window)
+
+    @property
+    def episode_length(self) -> float:
+        """Mean length of the cost-free episodes; a crash shortens its episode and would make the budget look larger."""
+        return max(self.mean_length.item(), 1.0)
+
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        """
+        Add one step of all environments.
+
+        :param costs: (n_envs,)
+        :param dones: (n_envs,)
+        """
+        for episode in self._under_way.add(costs, dones):
+            self._remember(episode)
+
+    def _remember(self, episode: FinishedEpisode) -> None:
+        slot = int(self.n_episodes) % self.window
+        self.costs[slot] = episode.cost
+        self.discounted_costs[slot] = episode.discounted_cost
+        self.n_episodes += 1
+        if episode.cost == 0:
+            self.mean_length += (episode.length - self.mean_length) / self.window
+
+    @th.no_grad()
+    def note_prediction(self, values: th.Tensor) -> None:
+        """
+        Add what the critic expects of whole episodes to a moving average.
+
+        :param values: discounted costs expected at episode starts, may be empty
+        """
+        if values.numel() > 0:
+            share = 1.0 - self.prediction_decay
+            self.prediction_sum += share * (values.mean() - self.prediction_sum)
+            self.prediction_weight += share * (1.0 - self.prediction_weight)
+
+    @property
+    def has_prediction(self) -> bool:
+        """Whether there has been any prediction."""
+        return self.prediction_weight.item() > 0.0
+
+    def calibration(self, epsilon: float) -> float:
+        """
+        Ratio of the predicted to the observed discounted cost of an episode.
+
+        :param epsilon: > 0, added to both, so that rare costs do not make the ratio jump
+        :return: the ratio, 1 as long as there is neither
+        """
+        predicted = self.prediction_sum.item() / max(self.prediction_weight.item(), 1e-8)
+        observed = self.discounted_costs[: self.size].mean().item() if self.size else 0.0
+        return (predicted + epsilon) / (observed + epsilon)
+
+    def tail_cost(self, risk_level: float) -> float:
+        """
+        Empirical conditional value at risk of the episode cost.
+
+        :param risk_level: alpha in (0, 1]
+        :return: mean of the worst fraction alpha of the remembered episodes, of which there must be one
+        """
+        n_worst = math.ceil(risk_level * self.size)
+        return self.costs[: self.size].topk(n_worst).values.mean().item()

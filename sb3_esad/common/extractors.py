@@ -1,0 +1,156 @@
+"""Features extractors that keep a picture's geometry: SB3's ``BaseFeaturesExtractor`` whose features are a grid, flattened."""
+
+import math
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from torch import nn
+
+from sb3_esad.common.functional import symlog
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, conv_block, mlp
+
+MIN_PIXELS = 16
+
+
+def check_image_size(space: spaces.Space, name: str) -> None:
+    """
+    Refuse images that are too small to be divided into cells.
+
+    :param space: channel-first image space
+    :param name: how to call the observation in the message
+    :raises ValueError: if height or width is below 16 pixels
+    """
+    if min(space.shape[1:]) < MIN_PIXELS:
+        raise ValueError(
+            f"The {name} of shape {space.shape} (channels, height, width) is too small: the encoder needs at least "
+            f"{MIN_PIXELS}x{MIN_PIXELS} pixels, so render it larger or use MlpPolicy on a vector."
+        )
+
+
+class SpatialCnn(BaseFeaturesExtractor):
+    """
+    Encode an image as a grid of features, one cell for 8x8 pixels.
+
+    :param observation_space: channel-first image space
+    :param channels: channels of each cell
+    :param hidden_channels: channels of the hidden layer, whose cells are 4x4 pixels
+    :param normalized_image: whether the images are floats already, then any number of channels is taken
+    :raises ValueError: if the image is smaller than 16x16 pixels
+    """
+
+    def __init__(
+        self, observation_space: spaces.Box, channels: int = 48, hidden_channels: int = 32, normalized_image: bool = False
+    ) -> None:
+        check_image_size(observation_space, "image")
+        image_channels, height, width = observation_space.shape
+        self.grid_shape: GridShape = (channels, math.ceil(height / 8), math.ceil(width / 8))
+        super().__init__(observation_space, math.prod(self.grid_shape))
+        self.normalized_image = normalized_image
+        self.layers = nn.Sequential(
+            nn.ZeroPad2d((0, -width % 8, 0, -height % 8)),
+            nn.Conv2d(image_channels, hidden_channels, 4, stride=4),
+            ChannelNorm(hidden_channels),
+            nn.SiLU(),
+            nn.Conv2d(hidden_channels, channels, 4, stride=2, padding=1),
+            ChannelNorm(channels),
+            nn.SiLU(),
+        )
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        Encode images.
+
+        :param observations: preprocessed images, of shape (N, C, H, W)
+        :return: flattened grids, of shape (N, features_dim)
+        """
+        return self.layers(observations).flatten(1)
+
+
+class VectorExtractor(BaseFeaturesExtractor):
+    """
+    Encode a vector by a perceptron on its symmetric logarithm.
+
+    :param observation_space: any space without images
+    :param features_dim: number of features
+    """
+
+    def __init__(self, observation_space: spaces.Space, features_dim: int = 256) -> None:
+        super().__init__(observation_space, features_dim)
+        self.layers = nn.Sequential(
+            nn.Flatten(), mlp(get_flattened_obs_dim(observation_space), [features_dim], features_dim), nn.SiLU()
+        )
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        """
+        Encode vectors.
+
+        :param observations: preprocessed observations, of shape (N, ...)
+        :return: features, of shape (N, features_dim)
+        """
+        return self.layers(symlog(observations))
+
+
+class CombinedExtractor(BaseFeaturesExtractor):
+    """
+    Encode a dictionary: images as grids, and every vector repeated in all cells.
+
+    :param observation_space: dictionary of images and vectors
+    :param channels: channels of each image's cells
+    :param vector_features: number of features of each vector
+    :param normalized_image: whether the images are floats already
+    :raises ValueError: if an image is smaller than 16x16 pixels
+    """
+
+    def __init__(
+        self, observation_space: spaces.Dict, channels: int = 48, vector_features: int = 64, normalized_image: bool = False
+    ) -> None:
+        extractors: dict[str, BaseFeaturesExtractor] = {}
+        for key, space in observation_space.spaces.items():
+            if is_image_space(space, normalized_image=normalized_image):
+                check_image_size(space, f"image '{key}'")
+                extractors[key] = SpatialCnn(space, channels, normalized_image=normalized_image)
+            else:
+                extractors[key] = VectorExtractor(space, vector_features)
+        shapes = {key: grid_shape(extractor) for key, extractor in extractors.items()}
+        height, width = (max(shape[axis] for shape in shapes.values()) for axis in (1, 2))
+        self.grid_shape: GridShape = (sum(shape[0] for shape in shapes.values()), height, width)
+        super().__init__(observation_space, math.prod(self.grid_shape))
+        self.extractors = nn.ModuleDict(extractors)
+        self.shapes = shapes
+
+    def forward(self, observations: dict[str, th.Tensor]) -> th.Tensor:
+        """
+        Encode dictionaries.
+
+        :param observations: preprocessed observations by key, of shapes (N, ...)
+        :return: flattened grids, of shape (N, features_dim)
+        """
+        grids = []
+        for key, extractor in self.extractors.items():
+            grid = extractor(observations[key]).unflatten(1, self.shapes[key])
+            grids.append(nn.functional.interpolate(grid, self.grid_shape[1:]))
+        return th.cat(grids, dim=1).flatten(1)
+
+
+def grid_shape(extractor: BaseFeaturesExtractor) -> GridShape:
+    """
+    Tell the grid that an extractor's flat features stand for.
+
+    :param extractor: any SB3 features extractor
+    :return: its own grid, or a single cell with all its features
+    """
+    return getattr(extractor, "grid_shape", (extractor.features_dim, 1, 1))
+
+
+def flat_shape(space: spaces.Space, image: bool) -> tuple[int, ...]:
+    """
+    Tell the shape of an observation after SB3's preprocessing.
+
+    :param space: a space of one observation (not a dictionary)
+    :param image: whether the space is an image
+    :return: its shape for images, (features,) otherwise
+    """
+    return tuple(np.array(space.shape).tolist()) if image else (get_flattened_obs_dim(space),)

@@ -1,0 +1,339 @@
+"""The template of all algorithms that learn from imagination: sample, fit the world model, imagine, improve the behaviour."""
+
+import io
+import pathlib
+from abc import abstractmethod
+from collections import defaultdict
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.utils import safe_mean
+
+from sb3_esad.common.buffers import SequenceReplayBuffer
+from sb3_esad.common.costs import CostReader, EpisodeCosts
+from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
+from sb3_esad.common.precision import autocast
+from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
+
+SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
+
+SETTLING_STEPS = 3
+"""Steps after the start of a window before its states are trusted: speeds are not visible in a single frame."""
+EVENT_HORIZON = 8
+"""Imagination also starts from states at most this many steps before a recorded cost."""
+
+
+class LatentAlgorithm(OffPolicyAlgorithm):
+    """
+    Base of the algorithms that improve their behaviour in the latent space of a world model.
+
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
+    :param env: environment with a Box action space
+    :param learning_rate: of all networks, a number or a function of the remaining progress
+    :param buffer_size: number of steps to remember
+    :param learning_starts: steps of random actions, each held for ``random_hold`` steps, before learning
+    :param batch_size: windows in a batch
+    :param sequence_length: steps in a window
+    :param tau: share of the learned networks in their targets at each update
+    :param gamma: discount
+    :param train_freq: environment steps between updates
+    :param gradient_steps: updates each time; -1 for as many as steps were made
+    :param action_noise: added to the actions while training
+    :param replay_buffer_class: a :class:`SequenceReplayBuffer`
+    :param replay_buffer_kwargs: its further arguments
+    :param optimize_memory_usage: must be False: frames are stored once anyway
+    :param pretrain_steps: updates of the world model alone, before the first update of the behaviour
+    :param imagination_horizon: H, imagined steps
+    :param imagination_starts: number of imagined trajectories in an update
+    :param lambda_return: mixing of n-step returns, in [0, 1]
+    :param random_hold: steps for which a random action of the warm-up is held
+    :param max_grad_norm: bound of the norm of each network's gradient
+    :param cost_key: key of the cost in the info dict; the cost of a step lies in [0, 1]
+    :param policy_kwargs: further arguments of the policy
+    :param stats_window_size: episodes over which the log averages
+    :param tensorboard_log: where to write TensorBoard logs
+    :param verbose: 0 silent, 1 info, 2 debug
+    :param device: where to compute
+    :param seed: of all random numbers
+    :param _init_setup_model: whether to build the networks at once
+    :raises ValueError: if an argument is out of its range
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": LatentPolicy,
+        "CnnPolicy": LatentCnnPolicy,
+        "MultiInputPolicy": LatentMultiInputPolicy,
+    }
+    policy: LatentPolicy
+    replay_buffer: SequenceReplayBuffer
+
+    def __init__(
+        self,
+        policy: str | type[LatentPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule = 3e-4,
+        buffer_size: int = 100_000,
+        learning_starts: int = 1000,
+        batch_size: int = 16,
+        sequence_length: int = 32,
+        tau: float = 0.02,
+        gamma: float = 0.97,
+        train_freq: int | tuple[int, str] = 4,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[SequenceReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        pretrain_steps: int = 200,
+        imagination_horizon: int = 12,
+        imagination_starts: int = 256,
+        lambda_return: float = 0.95,
+        random_hold: int = 5,
+        max_grad_norm: float = 100.0,
+        cost_key: str = "cost",
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: th.device | str = "auto",
+        seed: int | None = None,
+        _init_setup_model: bool = True,
+    ) -> None:
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class or SequenceReplayBuffer,
+            replay_buffer_kwargs,
+            optimize_memory_usage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+            supported_action_spaces=(spaces.Box,),
+        )
+        self.sequence_length = sequence_length
+        self.pretrain_steps = pretrain_steps
+        self.imagination_horizon = imagination_horizon
+        self.imagination_starts = imagination_starts
+        self.lambda_return = lambda_return
+        self.random_hold = random_hold
+        self.max_grad_norm = max_grad_norm
+        self.cost_key = cost_key
+        self.total_cost = 0.0
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        self.replay_buffer_kwargs = {
+            **self.replay_buffer_kwargs,
+            "sequence_length": self.sequence_length,
+            "cost_key": self.cost_key,
+        }
+        super()._setup_model()
+        self._last_latent: LatentState | None = None
+        self._random_actions: np.ndarray | None = None
+        self._read_costs = CostReader(self.cost_key)
+        self._episode_costs = EpisodeCosts()
+
+    # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        latent = self._filter_last_observation(n_envs)
+        if self.num_timesteps < learning_starts:
+            scaled = self._held_random_actions(n_envs)
+        else:
+            scaled = self.policy.act(latent).cpu().numpy()
+        if action_noise is not None:
+            scaled = np.clip(scaled + np.reshape(action_noise(), scaled.shape), -1, 1).astype(np.float32)
+        # The memory must hold the action that is executed, or it would learn from a world that did not happen
+        self._last_latent = latent._replace(action=th.as_tensor(scaled, device=self.device))
+        shaped = scaled.reshape(n_envs, *self.action_space.shape)
+        return self.policy.unscale_action(shaped).astype(self.action_space.dtype), shaped
+
+    def _filter_last_observation(self, n_envs: int) -> LatentState:
+        starts = self._last_episode_starts
+        if self._last_latent is None or starts is None:
+            starts, self._last_latent = np.ones(n_envs, dtype=bool), self.policy.initial_state(n_envs)
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        return self.policy.filter(observation, self._last_latent, th.as_tensor(starts, device=self.device), False)
+
+    def _held_random_actions(self, n_envs: int) -> np.ndarray:
+        if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:
+            actions = np.stack([self.action_space.sample() for _ in range(n_envs)])
+            self._random_actions = self.policy.scale_action(actions).reshape(n_envs, -1).astype(np.float32)
+        return self._random_actions
+
+    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:  # type: ignore[no-untyped-def, override]
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._last_episode_starts = dones
+
+    # Logging: what an episode costs stands beside what it earns
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        assert dones is not None
+        costs = self._read_costs(infos)
+        self.total_cost += float(costs.sum())
+        for episode in self._episode_costs.add(costs, dones):
+            infos[episode.env].get("episode", {})["c"] = episode.cost
+        super()._update_info_buffer(infos, dones)
+
+    def dump_logs(self) -> None:
+        """Write the log, costs included."""
+        costs = [info["c"] for info in self.ep_info_buffer or [] if "c" in info]
+        if costs:
+            self.logger.record("rollout/ep_cost_mean", safe_mean(costs))
+        self.logger.record("rollout/total_cost", self.total_cost)
+        self.logger.record("rollout/cost_rate", self.total_cost / max(self.num_timesteps, 1))
+        super().dump_logs()
+
+    # Learning
+
+    def learn(  # type: ignore[override]
+        self: SelfLatentAlgorithm,
+        total_timesteps: int = 100_000,
+        callback: MaybeCallback = None,
+        log_interval: int = 4,
+        tb_log_name: str | None = None,
+        reset_num_timesteps: bool = True,
+        progress_bar: bool = False,
+    ) -> SelfLatentAlgorithm:
+        """
+        Learn from the environment.
+
+        :param total_timesteps: number of environment steps
+        :param callback: called at every step
+        :param log_interval: episodes between two lines of the log
+        :param tb_log_name: name of the TensorBoard run; None for the name of the class
+        :param reset_num_timesteps: whether to count steps from zero
+        :param progress_bar: whether to show one
+        :return: the trained model
+        """
+        name = tb_log_name or type(self).__name__
+        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        observations = self._last_obs if isinstance(self._last_obs, dict) else {"observation": self._last_obs}
+        for key, images in observations.items():
+            if np.ndim(images) == 4 and np.max(images) == np.min(images):
+                raise ValueError(
+                    f"Every pixel of the first image '{key}' is {np.max(images)}: nothing can be learned from it. With highway-env, "
+                    "unset SDL_VIDEODRIVER (its value 'dummy' makes all images black)."
+                )
+        return result
+
+    def train(self, gradient_steps: int, batch_size: int = 16) -> None:
+        """
+        Update the world model and, in its imagination, the behaviour.
+
+        :param gradient_steps: number of updates
+        :param batch_size: windows in a batch
+        """
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(list(self._optimizers().values()))
+        logs: dict[str, list[float]] = defaultdict(list)
+        for _ in range(self.pretrain_steps if self._n_updates == 0 else 0):
+            self._update_world_model(self._sample(batch_size))
+        for _ in range(gradient_steps):
+            samples = self._sample(batch_size)
+            filtered, model_logs = self._update_world_model(samples)
+            with autocast(self.device):
+                behavior_logs = self._update_behavior(samples, filtered, self._imagine(samples, filtered))
+            for name, value in {**model_logs, **behavior_logs}.items():
+                logs[name].append(value)
+        self._n_updates += gradient_steps
+        self._record(logs)
+
+    @abstractmethod
+    def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
+        """
+        Improve actor and critics.
+
+        :param samples: recorded windows
+        :param filtered: their states, without gradient
+        :param imagined: trajectories of the present policy
+        :return: values to log
+        """
+
+    def _sample(self, batch_size: int) -> SequenceSamples:
+        return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
+
+    def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
+        with autocast(self.device):
+            loss, filtered, logs = self.policy.world_model.loss(samples)
+        logs["model_grad_norm"] = self._step(self.policy.world_model, loss)
+        return filtered.detach(), logs
+
+    def _step(self, network: th.nn.Module, loss: th.Tensor) -> float:
+        """Minimise a loss by one step of one network; whatever else it passed through gets no gradient."""
+        parameters = list(network.parameters())
+        network.optimizer.zero_grad()
+        loss.backward(inputs=parameters)
+        norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        network.optimizer.step()
+        return norm.item()
+
+    def _imagine(self, samples: SequenceSamples, filtered: Filtered) -> Imagination:
+        start = self._choose_starts(samples, filtered)
+        start = start._replace(action=self._first_actions(start))
+        return self.policy.world_model.imagine(start, self.policy.actor, self.imagination_horizon, self.gamma)
+
+    def _first_actions(self, start: LatentState) -> th.Tensor:
+        with th.no_grad():
+            return self.policy.actor(start)
+
+    def _choose_starts(self, samples: SequenceSamples, filtered: Filtered) -> LatentState:
+        """Half the starts come from uniformly drawn windows, half from shortly before a cost; the former stand first."""
+        eligible = filtered.settled(SETTLING_STEPS) & (samples.continues.T > 0)
+        usual = (eligible & samples.uniform).float().flatten()
+        time_to_event = samples.time_to_event.T.flatten()
+        dangerous = eligible.flatten().float() * ((time_to_event > 0) & (time_to_event <= EVENT_HORIZON))
+        half = self.imagination_starts // 2
+        chosen = th.cat([_draw(usual, half), _draw(dangerous if dangerous.any() else usual, self.imagination_starts - half)])
+        return filtered.states.map(lambda field: field.flatten(0, 1)[chosen])
+
+    def _record(self, logs: dict[str, list[float]]) -> None:
+        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
+        for name, values in logs.items():
+            self.logger.record(f"train/{name}", float(np.mean(values)))
+
+    # Saving
+
+    def _optimizers(self) -> dict[str, th.optim.Optimizer]:
+        names = ("world_model", "actor", "critic", "cost_critic")
+        return {f"policy.{name}.optimizer": getattr(self.policy, name).optimizer for name in names}
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        return ["policy", *self._optimizers()], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_read_costs", "_episode_costs"]
+
+
+def _draw(weights: th.Tensor, n: int) -> th.Tensor:
+    # A batch of very short windows may hold no eligible state at all; any is then better than none
+    return th.multinomial(weights if weights.any() else th.ones_like(weights), n, replacement=True)

@@ -1,0 +1,293 @@
+"""What a violated cost limit costs the policy: an augmented Lagrangian, or nothing."""
+
+import warnings
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_esad.common.episode_record import EpisodeRecord
+from sb3_esad.common.functional import discounted_budget, tail_factor
+from sb3_esad.common.type_aliases import Logs
+
+PATIENCE = 500
+"""Updates at the upper bound after which the user is warned."""
+
+
+class Penalty(nn.Module, ABC):
+    """How a cost limit enters the actor's loss and the choice of actions."""
+
+    @property
+    @abstractmethod
+    def budget(self) -> float:
+        """d, the discounted cost that is allowed."""
+
+    @property
+    @abstractmethod
+    def budget_scale(self) -> float:
+        """d_s > 0, by which violations are normalised."""
+
+    @property
+    @abstractmethod
+    def calibration(self) -> float:
+        """Predicted over observed discounted cost of an episode."""
+
+    @property
+    @abstractmethod
+    def calibrated(self) -> bool:
+        """Whether the predictions may be trusted."""
+
+    @abstractmethod
+    def forward(self, violation: th.Tensor) -> th.Tensor:
+        """
+        :param violation: Gamma - d, <= 0 where the limit is kept
+        :return: psi, the penalty of the violation, of the same shape
+        """
+
+    @abstractmethod
+    def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        """
+        :param objective: what the actor minimises apart from safety
+        :param risk: Gamma(s, a), of the same shape
+        :param barrier: residual of the barrier condition, of the same shape
+        :return: the loss of the actor, of the same shape
+        """
+
+    @abstractmethod
+    def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        """
+        :param risk: estimated Gamma of candidate actions
+        :param barrier: residual of the barrier condition, of the same shape
+        :return: bool, whether each candidate may be executed
+        """
+
+    @abstractmethod
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        """
+        Take note of one step of the environments.
+
+        :param costs: (n_envs,)
+        :param dones: (n_envs,)
+        """
+
+    @abstractmethod
+    def note_prediction(self, values: th.Tensor) -> None:
+        """
+        Take note of what the critic expects of whole episodes.
+
+        :param values: Q^c(s_0, pi(s_0)) at episode starts, may be empty
+        """
+
+    @abstractmethod
+    def update(self, violation: float | th.Tensor | None, gradient_steps: int = 1) -> Logs:
+        """
+        Move the multiplier.
+
+        :param violation: mean of Gamma - d over replayed states, None if the actor has not been updated since the last call
+        :param gradient_steps: number of updates since the last call
+        :return: values to log
+        """
+
+
+class NoPenalty(Penalty):
+    """
+    The absence of a limit: nothing is penalised, everything is admissible.
+
+    :param settings: those of :class:`AugmentedLagrangian`, so that either can be built by the same call; ignored
+    """
+
+    budget = 0.0
+    budget_scale = 1.0
+    calibration = 1.0
+    calibrated = True
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__()
+
+    def forward(self, violation: th.Tensor) -> th.Tensor:
+        return th.zeros_like(violation)  # not 0 * violation: nan must not leak
+
+    def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        return objective
+
+    def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        return th.ones_like(risk, dtype=th.bool)
+
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        pass
+
+    def note_prediction(self, values: th.Tensor) -> None:
+        pass
+
+    def update(self, violation: float | th.Tensor | None, gradient_steps: int = 1) -> Logs:
+        return {}
+
+
+class AugmentedLagrangian(Penalty):
+    """
+    psi(g) for the constraint g <= 0 (Nocedal & Wright 2006, Eq. 17.65), g = Gamma - d.
+
+    The multiplier integrates two signals, each normalised and clipped: what the critics expect and what the road has shown.
+    It holds still where they disagree, where neither is available and during a warm-up, lest it wind up on a violation
+    that the actor cannot, or need not, mend.
+
+    :param cost_limit: D >= 0, undiscounted cost allowed per episode
+    :param risk_level: alpha in (0, 1], worst fraction of episodes that shall keep the limit
+    :param cost_gamma: discount of the cost
+    :param episode_length: steps of an episode, assumed until cost-free ones have been seen
+    :param barrier_coef: weight of the violated barrier condition
+    :param lambda_lr: step of the multiplier per update, its integral gain
+    :param multiplier_init: initial multiplier
+    :param multiplier_bounds: lowest and highest multiplier
+    :param penalty_coef: rho >= 0, the proportional gain; 0 is the plain Lagrangian
+    :param penalty_warmup: updates during which the multiplier holds still
+    :param window: episodes remembered
+    :param min_episodes: finished episodes without which neither signal is trusted
+    :param calibration_band: predicted over observed cost within which the critics are trusted
+    :raises ValueError: if an argument is out of its range
+    """
+
+    multiplier: th.Tensor
+    mean_violation: th.Tensor
+    n_updates: th.Tensor
+    updates_at_bound: th.Tensor
+
+    def __init__(
+        self,
+        cost_limit: float,
+        risk_level: float = 0.5,
+        cost_gamma: float = 0.97,
+        episode_length: float = 1000.0,
+        barrier_coef: float = 1.0,
+        lambda_lr: float = 0.01,
+        multiplier_init: float = 1.0,
+        multiplier_bounds: tuple[float, float] = (0.05, 50.0),
+        penalty_coef: float = 1.0,
+        penalty_warmup: int = 1000,
+        window: int = 50,
+        min_episodes: int = 20,
+        calibration_band: tuple[float, float] = (1 / 3, 3.0),
+    ) -> None:
+        super().__init__()
+        tail_factor(risk_level)  # refuses a level outside (0, 1]
+        _check(cost_limit >= 0, "cost_limit", cost_limit, "the cost allowed per episode, >= 0, or None for no limit")
+        _check(0 <= cost_gamma <= 1, "cost_gamma", cost_gamma, "a discount in [0, 1]")
+        _check(episode_length >= 1, "episode_length", episode_length, "a number of steps >= 1")
+        _check(barrier_coef >= 0, "barrier_coef", barrier_coef, "a weight >= 0")
+        _check(lambda_lr >= 0, "lambda_lr", lambda_lr, "a step >= 0")
+        _check(penalty_coef >= 0, "penalty_coef", penalty_coef, "a gain >= 0")
+        low, high = multiplier_bounds
+        _check(0 <= low <= multiplier_init <= high, "multiplier_init", multiplier_init, f"one within {low} and {high}")
+        self.cost_limit = cost_limit
+        self.risk_level = risk_level
+        self.cost_gamma = cost_gamma
+        self.barrier_coef = barrier_coef
+        self.lambda_lr = lambda_lr
+        self.lower_bound, self.upper_bound = multiplier_bounds
+        self.penalty_coef = penalty_coef
+        self.penalty_warmup = penalty_warmup
+        self.min_episodes = min(min_episodes, window)
+        self.calibration_band = calibration_band
+        self.episodes = EpisodeRecord(cost_gamma, episode_length, window)
+        self.register_buffer("multiplier", th.tensor(float(multiplier_init)))
+        self.register_buffer("mean_violation", th.zeros(()))
+        self.register_buffer("n_updates", th.zeros(()))
+        self.register_buffer("updates_at_bound", th.zeros(()))
+        self._warned = False
+
+    @property
+    def budget(self) -> float:
+        return discounted_budget(self.cost_limit, self.cost_gamma, self.episodes.episode_length)
+
+    @property
+    def budget_scale(self) -> float:
+        return max(self.budget, 0.01)
+
+    @property
+    def calibration(self) -> float:
+        return self.episodes.calibration(epsilon=max(self.budget, 0.005))
+
+    @property
+    def calibrated(self) -> bool:
+        low, high = self.calibration_band
+        return self._enough_episodes and self.episodes.has_prediction and low <= self.calibration <= high
+
+    @property
+    def _enough_episodes(self) -> bool:
+        return self.episodes.size >= self.min_episodes
+
+    @property
+    def base_weight(self) -> th.Tensor:
+        """Weight of the risk where the barrier condition holds: integral plus proportional part, never a reward for cost."""
+        return (self.multiplier + self.penalty_coef * self.mean_violation).clamp(0.0, self.upper_bound)
+
+    def forward(self, violation: th.Tensor) -> th.Tensor:
+        # (relu(kappa + rho g)^2 - kappa^2) / (2 rho), written so that rho = 0 is the plain Lagrangian.
+        active = violation.clamp(min=-self.multiplier / max(self.penalty_coef, 1e-12))
+        return self.multiplier * active + 0.5 * self.penalty_coef * active**2
+
+    def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        excess = self.barrier_coef * th.relu(barrier.detach()) / self.budget_scale
+        weight = (self.base_weight + excess).clamp(max=self.upper_bound)
+        return (objective + weight * risk) / (1.0 + weight.mean())
+
+    def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        # The scale, not the budget: under a limit of 0 no estimate is ever exactly 0.
+        return (risk <= self.budget_scale) & (barrier <= 0.0)
+
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        self.episodes.observe(costs, dones)
+
+    def note_prediction(self, values: th.Tensor) -> None:
+        self.episodes.note_prediction(values)
+
+    @th.no_grad()
+    def update(self, violation: float | th.Tensor | None, gradient_steps: int = 1) -> Logs:
+        if violation is None:
+            return self._logs({})
+        signals = self._signals(float(violation))
+        if self.n_updates >= self.penalty_warmup and signals:
+            self._move(list(signals.values()), gradient_steps)
+        self.n_updates += gradient_steps
+        self._watch_bound(gradient_steps)
+        return self._logs(signals)
+
+    def _signals(self, violation: float) -> Logs:
+        signals = {}
+        if self.calibrated:
+            signals["violation_model"] = violation / self.budget_scale
+        if self._enough_episodes:
+            excess = self.episodes.tail_cost(self.risk_level) - self.cost_limit
+            signals["violation_road"] = excess / max(self.cost_limit, 0.02)
+        return {name: min(max(signal, -1.0), 1.0) for name, signal in signals.items()}
+
+    def _move(self, signals: list[float], gradient_steps: int) -> None:
+        mean = sum(signals) / len(signals)
+        self.mean_violation += (1.0 - 0.9**gradient_steps) * (mean - self.mean_violation)
+        if min(signals) * max(signals) >= 0.0:
+            step = self.lambda_lr * gradient_steps * mean
+            self.multiplier.add_(step).clamp_(self.lower_bound, self.upper_bound)
+
+    def _watch_bound(self, gradient_steps: int) -> None:
+        self.updates_at_bound.add_(gradient_steps).mul_(self.multiplier >= self.upper_bound)
+        if self.updates_at_bound >= PATIENCE and not self._warned:
+            self._warned = True
+            cause = f"cost_limit={self.cost_limit} cannot be met, or the cost critics are off by {self.calibration:.2f}"
+            warnings.warn(f"The multiplier stays at its upper bound {self.upper_bound}: {cause}.", stacklevel=2)
+
+    def _logs(self, signals: Logs) -> Logs:
+        return {
+            "lagrangian_multiplier": self.multiplier.item(),
+            "penalty_weight": self.base_weight.item(),
+            "budget": self.budget,
+            "cost_calibration": self.calibration,
+            "horizon": self.episodes.episode_length,
+            **signals,
+        }
+
+
+def _check(valid: bool, name: str, value: float, remedy: str) -> None:
+    if not valid:
+        raise ValueError(f"{name} is {value}; choose {remedy}.")

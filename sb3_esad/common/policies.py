@@ -1,0 +1,231 @@
+"""The policy of all latent algorithms: it owns every network, and acts with a memory that the caller carries."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.preprocessing import get_action_dim
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
+
+from sb3_esad.common.actor import Actor
+from sb3_esad.common.critics import CostCritic, QEnsemble, make_target
+from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
+from sb3_esad.common.latents import GaussianHead, LatentHead
+from sb3_esad.common.precision import autocast
+from sb3_esad.common.rssm import RSSM
+from sb3_esad.common.type_aliases import LatentState
+from sb3_esad.common.world_model import WorldModel
+
+NumpyState = tuple[np.ndarray, ...]
+
+
+class LatentPolicy(BasePolicy):
+    """
+    World model, actor and critics, with ``predict`` as SB3's recurrent policies have it.
+
+    :param observation_space: space of the observations
+    :param action_space: box of the actions
+    :param lr_schedule: learning rate of all networks
+    :param net_arch: hidden layers of actor, critics and heads
+    :param memory_channels: channels of the memory in each cell; None for 48 on a grid and 256 for vectors
+    :param latent_channels: channels of the stochastic latent in each cell; None for 8 on a grid and 32 for vectors
+    :param world_model_kwargs: further arguments of the world model
+    :param head_kwargs: further arguments of the latent head
+    :param features_extractor_class: encoder of the observations; its features become a grid if it has a ``grid_shape``
+    :param features_extractor_kwargs: arguments of the encoder
+    :param normalize_images: whether images are bytes to be divided by 255
+    :param optimizer_class: optimiser of each network
+    :param optimizer_kwargs: arguments of the optimisers
+    """
+
+    head_class: ClassVar[type[LatentHead]] = GaussianHead
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        action_space: spaces.Box,
+        lr_schedule: Schedule,
+        net_arch: list[int] | None = None,
+        memory_channels: int | None = None,
+        latent_channels: int | None = None,
+        world_model_kwargs: dict[str, Any] | None = None,
+        head_kwargs: dict[str, Any] | None = None,
+        features_extractor_class: type[BaseFeaturesExtractor] = VectorExtractor,
+        features_extractor_kwargs: dict[str, Any] | None = None,
+        normalize_images: bool = True,
+        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_kwargs: dict[str, Any] | None = None,
+    ) -> None:
+        super().__init__(
+            observation_space,
+            action_space,
+            features_extractor_class,
+            features_extractor_kwargs,
+            normalize_images=normalize_images,
+            optimizer_class=optimizer_class,
+            optimizer_kwargs={"fused": True} if optimizer_kwargs is None and optimizer_class is th.optim.Adam else optimizer_kwargs,
+            squash_output=True,
+        )
+        self.net_arch = net_arch or [256, 256]
+        self.memory_channels = memory_channels
+        self.latent_channels = latent_channels
+        self.world_model_kwargs = world_model_kwargs or {}
+        self.head_kwargs = head_kwargs or {}
+        self._build(lr_schedule)
+
+    def _build(self, lr_schedule: Schedule) -> None:
+        self.world_model = self._make_world_model()
+        rssm = self.world_model.rssm
+        grid = (rssm.memory_shape[0] + rssm.latent_shape[0], *rssm.memory_shape[1:])
+        self.actor = Actor(grid, rssm.action_dim, self.net_arch)
+        self.critic = QEnsemble(grid, rssm.action_dim, self.net_arch)
+        self.cost_critic = CostCritic(grid, rssm.action_dim, self.net_arch)
+        self.critic_target, self.cost_critic_target = make_target(self.critic), make_target(self.cost_critic)
+        self.to(memory_format=th.channels_last)
+        for network in (self.world_model, self.actor, self.critic, self.cost_critic):
+            network.optimizer = self.optimizer_class(network.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+
+    def _make_world_model(self) -> WorldModel:
+        extractor = self.make_features_extractor()
+        embedding_channels, *cells = grid_shape(extractor)
+        spatial = cells != [1, 1]
+        memory_shape = (self.memory_channels or (48 if spatial else 256), *cells)
+        latent_channels = self.latent_channels or (8 if spatial else 32)
+        head = self.head_class(memory_shape, embedding_channels, latent_channels, hidden_channels=memory_shape[0], **self.head_kwargs)
+        rssm = RSSM(memory_shape, latent_channels, get_action_dim(self.action_space), head)
+        return WorldModel(
+            self.observation_space, extractor, rssm, normalize_images=self.normalize_images, units=self.net_arch[0], **self.world_model_kwargs
+        )
+
+    def initial_state(self, n_envs: int) -> LatentState:
+        """
+        Give the memory that an episode starts with.
+
+        :param n_envs: number of environments
+        :return: zeros
+        """
+        return self.world_model.initial(n_envs)
+
+    @th.no_grad()
+    def filter(self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> LatentState:
+        """
+        Take in an observation, forgetting the past where an episode starts.
+
+        :param observation: of shape (N, ...)
+        :param state: the previous state and the executed action
+        :param episode_start: bool, of shape (N,)
+        :param deterministic: take the mean of the latent instead of a sample
+        :return: the present state
+        """
+        keep = ~episode_start
+        kept = state.map(lambda field: field * keep.view(-1, *[1] * (field.dim() - 1)))
+        with autocast(self.device):
+            return self.world_model.filter(kept, observation, deterministic)
+
+    @th.no_grad()
+    def act(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
+        """
+        Choose actions.
+
+        :param state: N states
+        :param deterministic: take the mode instead of a sample
+        :return: actions scaled to [-1, 1], of shape (N, A)
+        """
+        with autocast(self.device):
+            return self.actor(state, deterministic)
+
+    def predict(
+        self,
+        observation: np.ndarray | dict[str, np.ndarray],
+        state: NumpyState | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = False,
+    ) -> tuple[np.ndarray, NumpyState]:
+        """
+        Get the action for an observation and the memory of the episode so far.
+
+        :param observation: one observation, or one for each of N environments
+        :param state: what the last call returned; None where the episodes start
+        :param episode_start: which environments were just reset, of shape (N,); None for none
+        :param deterministic: take means instead of samples
+        :return: the action, and the memory to hand in next time, arrays of shape (1, N, size)
+        :raises ValueError: if ``state`` belongs to another number of environments
+        """
+        self.set_training_mode(False)
+        self._refuse_gym_reset(observation)
+        tensor, vectorized = self.obs_to_tensor(observation)
+        n_envs = len(next(iter(tensor.values())) if isinstance(tensor, dict) else tensor)
+        start = np.zeros(n_envs, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(-1)
+        latent = self.filter(tensor, self._from_numpy(state, n_envs), th.as_tensor(start, device=self.device), deterministic)
+        actions = self.act(latent, deterministic)
+        new_state = tuple(field.flatten(1)[None].cpu().numpy() for field in latent._replace(action=actions))
+        unscaled = self.unscale_action(actions.cpu().numpy().reshape(-1, *self.action_space.shape))
+        unscaled = unscaled.astype(self.action_space.dtype, copy=False)
+        return (unscaled if vectorized else unscaled[0]), new_state
+
+    def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
+        start = th.ones(n, dtype=th.bool, device=self.device)
+        return self.act(self.filter(observation, self.initial_state(n), start, deterministic), deterministic)
+
+    def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
+        """
+        Choose the first actions of episodes.
+
+        :param observation: of shape (N, ...)
+        :param deterministic: take means instead of samples
+        :return: actions scaled to [-1, 1], of shape (N, A)
+        """
+        return self._predict(observation, deterministic)
+
+    def _from_numpy(self, state: NumpyState | None, n_envs: int) -> LatentState:
+        initial = self.initial_state(n_envs)
+        if state is None:
+            return initial
+        if state[0].shape[1] != n_envs:
+            raise ValueError(
+                f"predict() was given {n_envs} observation(s) but a state for {state[0].shape[1]} environment(s): "
+                "pass the state that the last call returned for these environments, or None to start afresh."
+            )
+        fields = (th.as_tensor(array[0], device=self.device) for array in state)
+        return LatentState(*(field.view_as(zeros) for field, zeros in zip(fields, initial, strict=True)))
+
+    @staticmethod
+    def _refuse_gym_reset(observation: Any) -> None:
+        if isinstance(observation, tuple):
+            raise ValueError(
+                "predict() was given a tuple, as Gym's reset() returns it (you are mixing Gym API with SB3 VecEnv API): "
+                "pass the observation alone."
+            )
+
+    def _get_constructor_parameters(self) -> dict[str, Any]:
+        return {
+            **super()._get_constructor_parameters(),
+            "lr_schedule": self._dummy_schedule,
+            "net_arch": self.net_arch,
+            "memory_channels": self.memory_channels,
+            "latent_channels": self.latent_channels,
+            "world_model_kwargs": self.world_model_kwargs,
+            "head_kwargs": self.head_kwargs,
+            "features_extractor_class": self.features_extractor_class,
+            "features_extractor_kwargs": self.features_extractor_kwargs,
+            "optimizer_class": self.optimizer_class,
+            "optimizer_kwargs": self.optimizer_kwargs,
+        }
+
+
+class LatentCnnPolicy(LatentPolicy):
+    """:class:`LatentPolicy` for images; the memory keeps the picture's geometry."""
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = SpatialCnn, **kwargs: Any) -> None:
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+
+
+class LatentMultiInputPolicy(LatentPolicy):
+    """:class:`LatentPolicy` for dictionaries of images and vectors."""
+
+    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any) -> None:
+        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)

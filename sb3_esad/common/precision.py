@@ -1,0 +1,31 @@
+"""Mixed precision where the hardware gains from it."""
+
+import contextlib
+from contextlib import AbstractContextManager
+
+import torch as th
+
+
+def has_fast_bfloat16(device: th.device) -> bool:
+    """
+    Tell whether bfloat16 is native; emulated, it is far slower than float32 (pytorch issue 118499).
+
+    :param device: where the networks live
+    :return: whether to use it
+    """
+    if device.type == "cuda":
+        return th.cuda.is_bf16_supported(including_emulation=False)
+    capabilities = th.cpu.get_capabilities() if device.type == "cpu" else {}
+    return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
+
+
+def autocast(device: th.device) -> AbstractContextManager[None]:
+    """
+    Compute convolutions and matrix products in bfloat16 where that is native.
+
+    :param device: where the networks live
+    :return: a context, which does nothing elsewhere
+    """
+    if has_fast_bfloat16(device):
+        return th.autocast(device.type, dtype=th.bfloat16)
+    return contextlib.nullcontext()

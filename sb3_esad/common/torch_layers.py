@@ -1,0 +1,107 @@
+"""Building blocks shared by the world model and the behaviour networks: everything is a grid of cells, a vector is a grid of one cell."""
+
+import math
+from collections.abc import Sequence
+
+import torch as th
+from torch import nn
+
+GridShape = tuple[int, int, int]
+"""Channels, height and width of a grid of features."""
+
+
+class ChannelNorm(nn.LayerNorm):
+    """Layer normalisation over the channels of each cell of a grid."""
+
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Normalise each cell.
+
+        :param grid: features, of shape (N, C, H, W)
+        :return: normalised features of the same shape
+        """
+        return super().forward(grid.movedim(1, -1)).movedim(-1, 1)
+
+
+def kernel_size(shape: GridShape) -> int:
+    """
+    Give the width of a convolution that sees a cell's neighbours, where there are any.
+
+    :param shape: shape of the grid
+    :return: 3, or 1 for a grid of a single cell
+    """
+    return 3 if shape[1] * shape[2] > 1 else 1
+
+
+def same_conv(in_channels: int, out_channels: int, kernel: int) -> nn.Conv2d:
+    """
+    Build a convolution that keeps height and width.
+
+    :param in_channels: channels of the input
+    :param out_channels: channels of the output
+    :param kernel: odd width of the kernel
+    :return: the convolution
+    """
+    return nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2)
+
+
+def conv_block(in_channels: int, out_channels: int, kernel: int) -> nn.Sequential:
+    """
+    Build convolution, normalisation and activation.
+
+    :param in_channels: channels of the input
+    :param out_channels: channels of the output
+    :param kernel: odd width of the kernel
+    :return: the block
+    """
+    return nn.Sequential(same_conv(in_channels, out_channels, kernel), ChannelNorm(out_channels), nn.SiLU())
+
+
+def mlp(input_dim: int, net_arch: Sequence[int], output_dim: int, zero_output: bool = False) -> nn.Sequential:
+    """
+    Build a perceptron with normalised hidden layers.
+
+    :param input_dim: number of inputs
+    :param net_arch: units of each hidden layer
+    :param output_dim: number of outputs
+    :param zero_output: start with an output of zero, as heads that predict values do
+    :return: the network
+    """
+    layers: list[nn.Module] = []
+    for units in net_arch:
+        layers += [nn.Linear(input_dim, units), nn.LayerNorm(units), nn.SiLU()]
+        input_dim = units
+    output = nn.Linear(input_dim, output_dim)
+    if zero_output:
+        nn.init.zeros_(output.weight)
+        nn.init.zeros_(output.bias)
+    return nn.Sequential(*layers, output)
+
+
+class GridReadout(nn.Module):
+    """
+    Summarise a grid in one vector without losing what stands where.
+
+    :param shape: shape of the grid (C, H, W)
+    :param features_dim: length of the summary
+    :param flat_features: how many numbers the cells may hold together before they are mixed
+    """
+
+    def __init__(self, shape: GridShape, features_dim: int, flat_features: int = 512) -> None:
+        super().__init__()
+        channels, height, width = shape
+        cell_features = max(1, min(channels, flat_features // (height * width)))
+        self.features_dim = features_dim
+        self.cells = conv_block(channels, cell_features, 1)
+        self.mix = nn.Sequential(
+            nn.Flatten(), nn.Linear(cell_features * height * width, features_dim), nn.LayerNorm(features_dim), nn.SiLU()
+        )
+
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Summarise grids.
+
+        :param grid: features, of shape (N, C, H, W)
+        :return: summaries, of shape (N, features_dim)
+        """
+        return self.mix(self.cells(grid))

@@ -1,0 +1,197 @@
+"""The world model: a recurrent state-space model with heads for observation, reward, cost and continuation."""
+
+from collections.abc import Callable
+
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.type_aliases import TensorDict
+from torch import nn
+
+from sb3_esad.common.extractors import grid_shape
+from sb3_esad.common.decoders import ImageHead, VectorHead
+from sb3_esad.common.heads import PredictionHeads
+from sb3_esad.common.rssm import RSSM, Filtered
+from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, Predictions, SequenceSamples
+
+Observations = th.Tensor | TensorDict
+
+
+class WorldModel(nn.Module):
+    """
+    Latent world model.
+
+    :param observation_space: space of the observations, images channel-first
+    :param features_extractor: encodes preprocessed observations
+    :param rssm: dynamics of the latent state
+    :param normalize_images: whether images are bytes to be divided by 255
+    :param units: units of the heads' hidden layers
+    :param cost_weight: weight of a cost event in the loss of the cost head
+    :param foreground_weight: additional weight of the pixels that differ from the background
+    :param open_loop_length: longest stretch without observation that the model is trained to bridge, in steps
+    """
+
+    def __init__(
+        self,
+        observation_space: spaces.Space,
+        features_extractor: BaseFeaturesExtractor,
+        rssm: RSSM,
+        normalize_images: bool = True,
+        units: int = 256,
+        cost_weight: float = 10.0,
+        foreground_weight: float = 10.0,
+        open_loop_length: int = 8,
+    ) -> None:
+        super().__init__()
+        self.observation_space = observation_space
+        self.normalize_images = normalize_images
+        self.open_loop_length = open_loop_length
+        self.features_extractor = features_extractor
+        self.embedding_shape = grid_shape(features_extractor)
+        self.rssm = rssm
+        channels = rssm.memory_shape[0] + rssm.latent_shape[0]
+        grid = (channels, *rssm.memory_shape[1:])
+        self.predictions = PredictionHeads(grid, units, cost_weight)
+        self.observations = nn.ModuleDict(
+            {
+                key: ImageHead(grid, space.shape, foreground_weight)
+                if is_image_space(space, normalized_image=not normalize_images)
+                else VectorHead(grid, get_flattened_obs_dim(space))
+                for key, space in _by_key(observation_space).items()
+            }
+        )
+
+    def initial(self, n: int) -> LatentState:
+        """
+        Give the state before anything was seen.
+
+        :param n: number of states
+        :return: zeros
+        """
+        return self.rssm.initial(n)
+
+    def embed(self, observations: Observations) -> th.Tensor:
+        """
+        Encode observations.
+
+        :param observations: as stored, of shape (N, ...)
+        :return: embeddings for the posterior, of shape (N, C, H, W)
+        """
+        features = self.features_extractor(self._preprocess(observations))
+        return self.rssm.head.embed(features.unflatten(1, self.embedding_shape))
+
+    def filter(self, state: LatentState, observations: Observations, deterministic: bool = False) -> LatentState:
+        """
+        Take in one observation.
+
+        :param state: the previous state and the executed action, or :meth:`initial`
+        :param observations: as stored, of shape (N, ...)
+        :param deterministic: take the mean of the latent instead of a sample
+        :return: the next state
+        """
+        return self.rssm.filter(state, self.embed(observations), deterministic)
+
+    def observe(self, samples: SequenceSamples, hidden: th.Tensor) -> Filtered:
+        """
+        Filter windows of recorded steps.
+
+        :param samples: windows, batch-major
+        :param hidden: steps whose observation is withheld, of shape (T, B)
+        :return: states and distributions, time-major
+        """
+        actions = samples.actions.transpose(0, 1)
+        is_first = samples.is_first.transpose(0, 1).clone()
+        is_first[0] = True  # the model starts afresh at the start of a window too
+        opening = _map(samples.observations, lambda x: x.transpose(0, 1)[is_first])
+        embeddings = self.embed(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)))
+        first = self.filter(self.initial(int(is_first.sum())), opening)
+        return self.rssm.scan(first, is_first, actions, embeddings.unflatten(0, actions.shape[:2]), hidden)
+
+    @th.no_grad()
+    def imagine(
+        self, start: LatentState, policy: Callable[[LatentState], th.Tensor], horizon: int, gamma: float
+    ) -> Imagination:
+        """
+        Roll the policy out in the latent space.
+
+        :param start: N states and the first actions to take
+        :param policy: draws the actions that follow, of shape (N, A)
+        :param horizon: number of steps
+        :param gamma: discount in the weights
+        :return: the trajectories
+        """
+        state, states = start, [start]
+        for _ in range(horizon):
+            state = self.rssm.imagine(state)
+            state = state._replace(action=policy(state))
+            states.append(state)
+        trajectory = LatentState(*(th.stack(fields) for fields in zip(*states, strict=True)))
+        predictions = self.predict(trajectory.map(lambda field: field[1:]))
+        alive = th.cat([th.ones_like(predictions.continues[:1]), gamma * predictions.continues[:-1]])
+        return Imagination(trajectory, predictions, alive.cumprod(0))
+
+    def predict(self, states: LatentState) -> Predictions:
+        """
+        Predict reward, cost and continuation.
+
+        :param states: states reached, fields of shape (T, N, ...)
+        :return: fields of shape (T, N)
+        """
+        steps, n = states.memory.shape[:2]
+        return Predictions(*(field.view(steps, n) for field in self.predictions(states.grid.flatten(0, 1))))
+
+    def reconstruct(self, states: LatentState) -> dict[str, th.Tensor]:
+        """
+        Show what the states look like.
+
+        :param states: N states
+        :return: preprocessed observations by key, of shape (N, ...); the key of a single observation is "observation"
+        """
+        return {key: head(states.grid) for key, head in self.observations.items()}
+
+    def loss(self, samples: SequenceSamples) -> tuple[th.Tensor, Filtered, Logs]:
+        """
+        Fit the model to windows of recorded steps.
+
+        :param samples: windows, batch-major
+        :return: scalar loss, the filtered states, and what to log
+        """
+        steps = samples.rewards.T
+        seen = self._preprocess(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)))
+        filtered = self.observe(samples, self._withhold(steps))
+        grid = filtered.states.grid.flatten(0, 1)
+        targets = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
+        weights = samples.event_weights.expand_as(steps).flatten()
+        prediction_loss, logs = self.predictions.loss(grid, targets, weights)
+        kl_loss, kl_logs = self.rssm.head.loss(filtered.posterior, filtered.prior)
+        observation_losses = [head.loss(grid, _by_key(seen)[key]) for key, head in self.observations.items()]
+        observation_loss = th.stack(observation_losses).sum()
+        loss = observation_loss + prediction_loss + kl_loss
+        return loss, filtered, {**logs, **kl_logs, "observation_loss": observation_loss.item()}
+
+    def _withhold(self, steps: th.Tensor) -> th.Tensor:
+        # Half of the windows hide one stretch, so that the prior is trained on what it will be used for: going on alone
+        length, n = steps.shape
+        index = th.arange(length, device=steps.device)[:, None]
+        start = th.randint(1, max(2, length), (n,), device=steps.device)
+        stretch = th.randint(1, self.open_loop_length + 1, (n,), device=steps.device)
+        return (index >= start) & (index < start + stretch) & (th.rand(n, device=steps.device) < 0.5)
+
+    def _preprocess(self, observations: Observations) -> Observations:
+        # Images are as exact in bfloat16 as they were as bytes, and half as large
+        dtype = th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else th.float32
+        preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
+        return _map(preprocessed, lambda x: x.to(dtype) if x.dim() == 4 else x)
+
+
+def _by_key(value):  # type: ignore[no-untyped-def]
+    if isinstance(value, spaces.Dict):
+        return value.spaces
+    return value if isinstance(value, dict) else {"observation": value}
+
+
+def _map(observations: Observations, function: Callable[[th.Tensor], th.Tensor]) -> Observations:
+    if isinstance(observations, dict):
+        return {key: function(value) for key, value in observations.items()}
+    return function(observations)

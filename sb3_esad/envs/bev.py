@@ -1,0 +1,150 @@
+"""Bird's-eye view of the traffic around the ego vehicle, drawn with OpenCV to a fraction of a pixel."""
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_esad.envs.geometry import Floats, box_corners
+from sb3_esad.envs.roads import Markings
+from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.users import Kind
+
+Image = NDArray[np.uint8]
+Colour = int | tuple[int, int, int]
+
+SUBPIXEL_BITS = 4
+BLEED = 0.7 * 2**SUBPIXEL_BITS  # measured: a filled shape comes out this much larger on every side [px / 16]
+STANDING_GREY, USER_SPAN, EGO_SPAN, OBSTACLE_GREY = 95, 160, 100, 255
+TOP_SPEED = 40.0  # the speed of the brightest grey level [m/s]
+OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
+
+
+class View:
+    """
+    A window on the world that looks up the image along a given heading, and draws into it.
+
+    :param shape: rows and columns [px]
+    :param metres_per_pixel: along the heading (rows) and across it (columns) [m/px]
+    :param ahead: share of the rows that lie ahead of the origin
+    """
+
+    def __init__(self, shape: Sequence[int], metres_per_pixel: Sequence[float], ahead: float) -> None:
+        self.shape = (int(shape[0]), int(shape[1]))
+        self._scale = np.array([1 / metres_per_pixel[1], -1 / metres_per_pixel[0]]) * 2**SUBPIXEL_BITS
+        centre = np.array([self.shape[1] / 2, self.shape[0] * ahead]) - 0.5  # OpenCV counts from the first pixel's centre
+        self._centre = centre * 2**SUBPIXEL_BITS
+        self._limit = np.array([self.shape[1], self.shape[0]]) * 2**SUBPIXEL_BITS
+
+    def pixels(self, points: Floats, origin: Floats, heading: float) -> NDArray[np.int32]:
+        """
+        Pixel coordinates of points of the world.
+
+        :param points: shape ``(..., 2)`` [m]
+        :param origin: the point of view, shape ``(2,)`` [m]
+        :param heading: the direction that points up [rad]
+        :return: column and row in fixed point, shape ``(..., 2)`` [px / 16]
+        """
+        cos, sin = np.cos(heading), np.sin(heading)
+        turn = np.array([[-sin, cos], [cos, sin]]).T
+        return np.rint((points - origin) @ turn * self._scale + self._centre).astype(np.int32)
+
+    def visible(self, shapes: NDArray[np.int32]) -> list[int]:
+        """
+        Which shapes may have a part in the image.
+
+        :param shapes: pixel coordinates of n shapes of k points, shape ``(n, k, 2)`` [px / 16]
+        :return: their indices
+        """
+        low, high = shapes.min(1), shapes.max(1)
+        columns, rows = self._limit
+        seen = (high[:, 0] >= 0) & (high[:, 1] >= 0) & (low[:, 0] <= columns) & (low[:, 1] <= rows)
+        return np.flatnonzero(seen).tolist()
+
+    def fill(self, images: Sequence[Image], shapes: NDArray[np.int32], colours: Sequence[Colour]) -> None:
+        """
+        Fill convex polygons.
+
+        :param images: the image each polygon is drawn into, shape ``(rows, columns)`` or ``(rows, columns, 3)``
+        :param shapes: pixel coordinates, shape ``(n, k, 2)`` [px / 16]
+        :param colours: one per polygon
+        """
+        for index in self.visible(shapes):
+            cv2.fillConvexPoly(images[index], shapes[index], colours[index], cv2.LINE_AA, SUBPIXEL_BITS)
+
+    def lines(self, image: Image, segments: NDArray[np.int32], colours: Sequence[Colour], thickness: int = 1) -> None:
+        """
+        Draw straight lines.
+
+        :param image: drawn into
+        :param segments: pixel coordinates, shape ``(n, 2, 2)`` [px / 16]
+        :param colours: one per line
+        :param thickness: [px]
+        """
+        for index in self.visible(segments):
+            cv2.polylines(image, [segments[index]], False, colours[index], thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+
+
+def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
+    """
+    Move the sides of parallelograms inwards by what OpenCV's anti-aliasing adds, so that they cover their true area.
+
+    :param shapes: pixel coordinates of their corners in order, shape ``(n, 4, 2)`` [px / 16]
+    :return: the same, smaller
+    """
+    sides = shapes[:, [1, 2, 3, 0]] - shapes
+    lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1.0)
+    steps = BLEED / lengths[..., None] * sides
+    return np.rint(shapes + steps - steps[:, [3, 0, 1, 2]]).astype(np.int32)
+
+
+def user_greys(traffic: Traffic) -> list[int]:
+    """
+    Grey levels that tell the speed of vehicles, the ego vehicle's span being the smaller; 255 for what must not be hit.
+
+    :param traffic: all road users
+    :return: one grey level per user; never 0, which means that nobody is there
+    """
+    share = np.minimum(traffic.speed / TOP_SPEED, 1.0)
+    grey = np.where(traffic.kind == Kind.VEHICLE, STANDING_GREY + USER_SPAN * share, OBSTACLE_GREY)
+    grey[EGO] = STANDING_GREY + EGO_SPAN * share[EGO]
+    return np.rint(grey).astype(int).tolist()
+
+
+class BirdsEyeView:
+    """
+    The image an agent sees, channel first; a mirrored world gives the mirrored image.
+
+    Channel 0 is the road: surface, brighter where the route leads, and painted lines. Channel 1 holds the moving users,
+    brighter the faster they are. Channel 2 holds the ego vehicle, brightened likewise, and at 255 what must not be hit.
+
+    :param view: size and scale of the image
+    """
+
+    def __init__(self, view: View) -> None:
+        self.view = view
+
+    def draw(self, markings: Markings, traffic: Traffic, heading: float) -> Image:
+        """
+        Draw the surroundings of the ego vehicle.
+
+        :param markings: of the road
+        :param traffic: all road users
+        :param heading: the direction that points up [rad]
+        :return: the image, shape ``(3, rows, columns)``
+        """
+        view, origin = self.view, traffic.position[EGO]
+        image = np.zeros((3, *view.shape), dtype=np.uint8)
+        road, users, obstacles = image
+        corners = box_corners(traffic.position, traffic.heading, traffic.size)
+        moves = traffic.kind == Kind.VEHICLE
+        moves[EGO] = False
+        asphalt = view.pixels(markings.surfaces, origin, heading)
+        boxes = inset(view.pixels(corners, origin, heading))
+        layers = [road] * len(asphalt) + [users if moving else obstacles for moving in moves]
+        greys = [ROUTE_GREY if on_route else OFF_ROUTE_GREY for on_route in markings.on_route] + user_greys(traffic)
+        view.fill(layers, np.concatenate([asphalt, boxes]), greys)
+        paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
+        view.lines(road, view.pixels(markings.lines, origin, heading), paint)
+        return image

@@ -1,0 +1,102 @@
+"""A picture of a scene for people, and a window to show it in."""
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_esad.envs.bev import View
+from sb3_esad.envs.geometry import box_corners
+from sb3_esad.envs.scenario import Scenario
+from sb3_esad.envs.traffic import EGO
+from sb3_esad.envs.users import Kind
+
+Image = NDArray[np.uint8]
+Colour = tuple[int, int, int]
+
+PICTURE = View((960, 320), (1 / 8, 1 / 8), 0.75)
+GRASS, ASPHALT, ROUTE, PAINT = (44, 62, 48), (70, 70, 74), (92, 92, 98), (225, 225, 225)
+EGO_COLOUR, CRASH_COLOUR, STATIC_COLOUR, PERSON_COLOUR = (64, 220, 110), (235, 60, 50), (240, 150, 40), (240, 90, 200)
+SLOW_COLOUR, FAST_COLOUR = np.array([60.0, 90.0, 170.0]), np.array([130.0, 200.0, 255.0])
+FASTEST = 30.0  # [m/s]
+
+
+def draw_scene(scenario: Scenario) -> Image:
+    """
+    Draw the surroundings of the ego vehicle, its lane's direction to the right, with the figures that matter.
+
+    :param scenario: a scenario that was reset
+    :return: RGB picture, shape ``(320, 960, 3)``
+    """
+    traffic, markings = scenario.traffic, scenario.road.markings
+    origin, heading = traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error
+    canvas = np.empty((*PICTURE.shape, 3), dtype=np.uint8)
+    canvas[:] = GRASS
+    asphalt = [ROUTE if on_route else ASPHALT for on_route in markings.on_route]
+    PICTURE.fill([canvas] * len(asphalt), PICTURE.pixels(markings.surfaces, origin, heading), asphalt)
+    lines = PICTURE.pixels(markings.lines, origin, heading)
+    PICTURE.lines(canvas, lines, [PAINT] * len(lines), 2)
+    boxes = PICTURE.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)
+    PICTURE.fill([canvas] * len(boxes), boxes, [_colour(scenario, row) for row in range(len(boxes))])
+    picture = np.ascontiguousarray(np.rot90(canvas, -1))
+    _write(picture, scenario)
+    return picture
+
+
+def _colour(scenario: Scenario, row: int) -> Colour:
+    traffic = scenario.traffic
+    if row == EGO:
+        return CRASH_COLOUR if scenario.crashed else EGO_COLOUR
+    if traffic.kind[row] == Kind.VEHICLE:
+        share = min(float(traffic.speed[row]) / FASTEST, 1.0)
+        red, green, blue = np.rint(SLOW_COLOUR + share * (FAST_COLOUR - SLOW_COLOUR)).astype(int).tolist()
+        return red, green, blue
+    return PERSON_COLOUR if traffic.kind[row] == Kind.PERSON else STATIC_COLOUR
+
+
+def _write(picture: Image, scenario: Scenario) -> None:
+    episode = scenario.episode
+    parts = (
+        f"speed {scenario.traffic.speed[EGO]:4.1f} m/s",
+        f"cost {episode.total_cost:.1f}",
+        f"reward {episode.total_reward:.1f}",
+        f"route {100 * (1 - scenario.remaining):.0f} %",
+        f"{episode.time:.1f} s",
+    )
+    text = "    ".join(parts)
+    cv2.putText(picture, text, (12, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.55, PAINT, 1, cv2.LINE_AA)
+
+
+class Window:
+    """
+    Shows pictures on the screen, by pygame.
+
+    :param fps: pictures a second
+    """
+
+    def __init__(self, fps: int) -> None:
+        import pygame
+
+        self._pygame: Any = pygame
+        self._fps = fps
+        pygame.display.init()
+        self._clock = pygame.time.Clock()
+        self._screen: Any = None
+
+    def show(self, picture: Image) -> None:
+        """
+        Show a picture, and wait for its time to pass.
+
+        :param picture: RGB, shape ``(rows, columns, 3)``
+        """
+        if self._screen is None:
+            self._screen = self._pygame.display.set_mode((picture.shape[1], picture.shape[0]))
+        self._screen.blit(self._pygame.surfarray.make_surface(picture.swapaxes(0, 1)), (0, 0))
+        self._pygame.event.pump()
+        self._pygame.display.flip()
+        self._clock.tick(self._fps)
+
+    def close(self) -> None:
+        """Close the window."""
+        self._pygame.display.quit()

@@ -1,0 +1,107 @@
+"""Scripted drivers that set the marks for a scenario; some read the simulator's state, which an agent cannot."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+from sb3_esad.envs.roads import NO_LANE
+from sb3_esad.envs.scenario import Scenario
+from sb3_esad.envs.traffic import EGO
+
+HEADING_GAIN, LATERAL_GAIN = 2.5, 0.7  # gentler than the traffic's, for who decides 5 times a second [1/s]
+SETTLED_OFFSET, SETTLED_HEADING = 0.5, 0.05  # a lane change is over within these [m], [rad]
+_SELF = np.array([EGO])
+
+
+def scenario_of(env: gymnasium.Env[Any, Any]) -> Scenario:
+    """
+    The scenario inside its wrappers.
+
+    :param env: a scenario, wrapped or not
+    :return: the scenario
+    :raises TypeError: if it is none
+    """
+    scenario = env.unwrapped
+    if not isinstance(scenario, Scenario):
+        raise TypeError(f"{scenario} is no driving scenario; scripted drivers need one of sb3_esad.envs")
+    return scenario
+
+
+class SpeedKeeper:
+    """Holds its speed and its lane, whatever is ahead."""
+
+    def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
+        """
+        Choose an action.
+
+        :param env: a driving scenario, wrapped or not
+        :return: acceleration and steering, shape ``(2,)``
+        """
+        scenario = scenario_of(env)
+        return self._action(scenario, 0.0, int(scenario.traffic.lane[EGO]))
+
+    def _action(self, scenario: Scenario, acceleration: float, lane: int) -> NDArray[np.float32]:
+        wheel_angle = float(scenario.traffic.steering(_SELF, np.array([lane]), HEADING_GAIN, LATERAL_GAIN)[0])
+        return scenario.controls.encode(acceleration, wheel_angle, float(scenario.traffic.speed[EGO]))
+
+
+class CarFollower(SpeedKeeper):
+    """Keeps its lane and follows the car ahead by the Intelligent Driver Model."""
+
+    def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
+        """See :meth:`SpeedKeeper.__call__`."""
+        scenario = scenario_of(env)
+        lane = self._lane(scenario)
+        lanes = {int(scenario.traffic.lane[EGO]), lane}
+        return self._action(scenario, min(self._following(scenario, each) for each in lanes), lane)
+
+    def _lane(self, scenario: Scenario) -> int:
+        return int(scenario.traffic.lane[EGO])
+
+    @staticmethod
+    def _following(scenario: Scenario, lane: int) -> float:
+        front, _ = scenario.traffic.neighbours(_SELF, np.array([lane]))
+        return float(scenario.traffic.following_acceleration(_SELF, front, _SELF)[0])
+
+
+class ReferenceDriver(CarFollower):
+    """Follows by the Intelligent Driver Model and overtakes by MOBIL; one object per environment."""
+
+    def __init__(self) -> None:
+        self._episode: object = None
+        self._target = NO_LANE
+
+    def _lane(self, scenario: Scenario) -> int:
+        traffic, lane = scenario.traffic, int(scenario.traffic.lane[EGO])
+        if scenario.episode is not self._episode:
+            self._episode, self._target = scenario.episode, lane
+        if lane != self._target:
+            if traffic.rival_ahead(EGO, self._target, traffic.target_lane):
+                self._target = lane
+        elif abs(traffic.across[lane, EGO]) < SETTLED_OFFSET and abs(scenario.heading_error) < SETTLED_HEADING:
+            self._target = self._best_lane(scenario, lane)
+        return self._target
+
+    @staticmethod
+    def _best_lane(scenario: Scenario, lane: int) -> int:
+        road, traffic = scenario.road, scenario.traffic
+        beside = [int(each) for each in (road.left[lane], road.right[lane]) if each != NO_LANE and road.on_route[each]]
+        worth = [each for each in beside if traffic.change_is_worth_it(_SELF, np.array([each]))[0]]
+        return max(worth, key=lambda each: CarFollower._following(scenario, each)) if worth else lane
+
+
+class RandomDriver:
+    """
+    Draws every action anew.
+
+    :param seed: of its random numbers
+    """
+
+    def __init__(self, seed: int = 0) -> None:
+        self._random = np.random.default_rng(seed)
+
+    def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
+        """See :meth:`SpeedKeeper.__call__`."""
+        return self._random.uniform(-1.0, 1.0, 2).astype(np.float32)

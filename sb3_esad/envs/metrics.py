@@ -1,0 +1,239 @@
+"""Driving metrics of the paper (section "Evaluation Metrics"): one record per episode, one row of figures per experiment."""
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any, SupportsFloat
+
+import gymnasium
+import numpy as np
+from numpy.typing import NDArray
+
+Record = dict[str, float]
+
+PENALTIES = {"person": 0.50, "vehicle": 0.60, "static": 0.65, "red_light": 0.70}
+COLLISIONS = ("person", "vehicle", "static")
+LONGEST_TTC = 20.0  # a time to collision above this is no risk worth telling apart [s]
+Z_95 = 1.959964
+WORST_SHARE = 0.1
+
+
+class Episode:
+    """
+    Adds up what happens in one episode.
+
+    :param route_length: [m]
+    """
+
+    def __init__(self, route_length: float) -> None:
+        self.route_length = route_length
+        self.infractions = dict.fromkeys(PENALTIES, 0)
+        self.steps = 0
+        self.time = self.distance = self.off_route = self.furthest = 0.0
+        self.total_reward = self.total_cost = 0.0
+        self.min_ttc = LONGEST_TTC
+
+    def add_motion(self, duration: float, metres: float, progress: float, on_route: bool) -> None:
+        """
+        Note how far the vehicle came in a step.
+
+        :param duration: of the step [s]
+        :param metres: driven [m]
+        :param progress: position along the route at the end of the step [m]
+        :param on_route: whether the step counts as driven on the route
+        """
+        self.steps += 1
+        self.time += duration
+        self.distance += metres
+        self.off_route += 0.0 if on_route else metres
+        self.furthest = max(self.furthest, progress)
+
+    def add_outcome(self, reward: float, cost: float, ttc: float) -> None:
+        """
+        Note what a step was worth.
+
+        :param reward: of the step
+        :param cost: of the step
+        :param ttc: time to collision at its end; infinite if nothing is being approached [s]
+        """
+        self.total_reward += reward
+        self.total_cost += cost
+        self.min_ttc = min(self.min_ttc, ttc)
+
+    def add_infraction(self, name: str) -> None:
+        """
+        Note an infraction.
+
+        :param name: a key of ``PENALTIES``
+        """
+        self.infractions[name] += 1
+
+    def record(self, success: bool) -> Record:
+        """
+        The episode as a flat dictionary of plain floats.
+
+        :param success: whether the route's end was reached
+        :return: route completion R, infraction score P and driving score R P within [0, 1], counts, metres, seconds
+        """
+        completion = min(max(self.furthest - self.off_route, 0.0) / self.route_length, 1.0)
+        score = math.prod(PENALTIES[name] ** count for name, count in self.infractions.items())
+        return {
+            "route_completion": completion,
+            "infraction_score": score,
+            "driving_score": completion * score,
+            "success": float(success),
+            "collisions": float(sum(self.infractions[name] for name in COLLISIONS)),
+            "infractions": float(sum(self.infractions.values())),
+            **{f"infractions_{name}": float(count) for name, count in self.infractions.items()},
+            "distance": self.distance,
+            "off_route": self.off_route,
+            "duration": self.time,
+            "steps": float(self.steps),
+            "mean_speed": self.distance / self.time if self.time > 0 else 0.0,
+            "min_ttc": self.min_ttc,
+            "return": self.total_reward,
+            "cost": self.total_cost,
+        }
+
+
+class DrivingMetrics(gymnasium.Wrapper[Any, Any, Any, Any]):
+    """
+    Keeps the records of all finished episodes of a driving scenario in ``records``.
+
+    :param env: an environment that puts its record into ``info["driving"]`` when an episode ends
+    """
+
+    def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
+        super().__init__(env)
+        self.records: list[Record] = []
+
+    def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
+        """
+        Step the environment, and file the record of the episode if it is over.
+
+        :param action: passed on
+        :return: what the environment returns
+        :raises KeyError: if an episode ends without a record
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        if terminated or truncated:
+            if "driving" not in info:
+                raise KeyError(f"{self.env} ended an episode without info['driving']; wrap a scenario of sb3_esad.envs")
+            self.records.append(info["driving"])
+        return observation, reward, terminated, truncated, info
+
+
+def wilson_interval(successes: float, count: int) -> tuple[float, float]:
+    """
+    95 % interval of a share (Wilson, 1927); sensible also at 0 and 1.
+
+    :param successes: how often it happened
+    :param count: of how many
+    :return: lower and upper bound within [0, 1]
+    """
+    share, square = successes / count, Z_95**2 / count
+    centre = (share + square / 2) / (1 + square)
+    half = Z_95 * math.sqrt(share * (1 - share) / count + square / (4 * count)) / (1 + square)
+    return max(centre - half, 0.0), min(centre + half, 1.0)
+
+
+def mean_interval(values: NDArray[np.floating]) -> tuple[float, float]:
+    """
+    95 % interval of a mean, by Student's t.
+
+    :param values: independent, shape ``(n,)``
+    :return: lower and upper bound; both the mean itself if there is one value only
+    """
+    from scipy.stats import t
+
+    mean, count = float(np.mean(values)), len(values)
+    if count < 2:
+        return mean, mean
+    half = float(t.ppf(0.975, count - 1)) * float(np.std(values, ddof=1)) / math.sqrt(count)
+    return mean - half, mean + half
+
+
+def worst_mean(values: NDArray[np.floating], share: float = WORST_SHARE) -> float:
+    """
+    Mean of the highest values: the empirical conditional value at risk.
+
+    :param values: shape ``(n,)``
+    :param share: of the values that count as the worst, (0, 1]; at least one value does
+    :return: their mean
+    """
+    count = max(math.ceil(share * len(values) - 1e-9), 1)
+    return float(np.sort(values)[-count:].mean())
+
+
+def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
+    """
+    Turn episode records into the figures of a table.
+
+    ``DS``, ``RC``, ``IS`` (0 to 100), ``success`` and ``collision_free`` (shares), ``CO`` (collisions per 100 m), ``CR``
+    (collisions per km), ``IPK`` (infractions per km), ``TTC`` and ``TTC_5`` (mean and 5th percentile of the episodes'
+    smallest time to collision, s), ``speed`` (m/s), ``return``, ``cost`` and ``cost_cvar`` (mean cost of the worst tenth).
+    ``<name>_low`` and ``<name>_high`` bound 95 % intervals: Wilson's for shares, Student's t for means.
+
+    :param records: of at least one episode
+    :return: the figures by name
+    :raises ValueError: if there are no records
+    """
+    if not records:
+        raise ValueError("summarise() got no records; run at least one episode to its end")
+    columns = {name: np.array([record[name] for record in records], dtype=np.float64) for name in records[0]}
+    means = {
+        "DS": 100 * columns["driving_score"],
+        "RC": 100 * columns["route_completion"],
+        "IS": 100 * columns["infraction_score"],
+        "TTC": columns["min_ttc"],
+        "speed": columns["mean_speed"],
+        "return": columns["return"],
+        "cost": columns["cost"],
+    }
+    shares = {"success": columns["success"], "collision_free": columns["collisions"] == 0}
+    kilometres = max(columns["distance"].sum() / 1000, 1e-9)
+    figures = {"episodes": float(len(records))}
+    for name, values in means.items():
+        figures[name] = float(values.mean())
+        figures[f"{name}_low"], figures[f"{name}_high"] = mean_interval(values)
+    for name, values in shares.items():
+        figures[name] = float(values.mean())
+        figures[f"{name}_low"], figures[f"{name}_high"] = wilson_interval(float(values.sum()), len(values))
+    figures["CR"] = float(columns["collisions"].sum() / kilometres)
+    figures["CO"] = figures["CR"] / 10
+    figures["IPK"] = float(columns["infractions"].sum() / kilometres)
+    figures["TTC_5"] = float(np.percentile(columns["min_ttc"], 5))
+    figures["cost_cvar"] = worst_mean(columns["cost"])
+    return figures
+
+
+TABLE_COLUMNS = {
+    "DS": ".1f", "RC": ".1f", "IS": ".1f", "CO": ".3f", "CR": ".2f", "IPK": ".2f", "TTC": ".2f", "TTC_5": ".2f",
+    "success": ".2f", "collision_free": ".2f", "speed": ".1f", "return": ".1f", "cost": ".2f", "cost_cvar": ".2f",
+}  # fmt: skip
+
+
+def format_header() -> str:
+    """
+    Head of the Markdown table that :func:`format_row` fills.
+
+    :return: two lines
+    """
+    names = ["", *TABLE_COLUMNS]
+    return f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
+
+
+def format_row(name: str, figures: Mapping[str, float]) -> str:
+    """
+    One row of a Markdown table.
+
+    :param name: first cell
+    :param figures: from :func:`summarise`
+    :return: one line, the interval of DS and of the collision-free share in brackets
+    """
+    cells = []
+    for key, form in TABLE_COLUMNS.items():
+        cell = f"{figures[key]:{form}}"
+        if key in ("DS", "collision_free"):
+            cell += f" [{figures[f'{key}_low']:{form}}, {figures[f'{key}_high']:{form}}]"
+        cells.append(cell)
+    return f"| {' | '.join([name, *cells])} |"

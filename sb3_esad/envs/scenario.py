@@ -1,0 +1,267 @@
+"""The frame that all driving scenarios share: spaces, time, physics, costs, rewards and the episode's record."""
+
+import math
+from collections import Counter
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium import spaces
+from numpy.typing import NDArray
+
+from sb3_esad.envs import rewards
+from sb3_esad.envs.config import merge_config
+from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
+from sb3_esad.envs.metrics import Episode
+from sb3_esad.envs.observations import OBSERVATIONS, Observation
+from sb3_esad.envs.roads import Road
+from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.users import Kind
+from sb3_esad.envs.vehicle import Controls
+
+REGION_LENGTH = 20.0  # [m]
+
+
+class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
+    """
+    A drive along a route among other road users; subclasses place road and traffic.
+
+    The action is acceleration and steering in [-1, 1]. ``info`` holds at every step ``cost`` (1 on a collision, off the
+    road, in the wrong direction or past a red light, else 0), ``cost_terms``, ``rewards`` (the terms by name), ``speed``
+    and ``crashed``; at an episode's end also ``is_success`` and ``driving``, the record of :class:`Episode`.
+
+    :param config: overrides of :meth:`default_config`
+    :param observation: ``"image"``, ``"vector"`` or ``"dict"``
+    :param render_mode: ``"rgb_array"``, ``"human"`` or None
+    """
+
+    metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 5}  # noqa: RUF012 - typed by gymnasium
+    road: Road
+    traffic: Traffic
+    route_length: float
+
+    def __init__(
+        self, config: dict[str, Any] | None = None, observation: str = "image", render_mode: str | None = None
+    ) -> None:
+        if observation not in OBSERVATIONS:
+            raise ValueError(f"unknown observation {observation!r}; choose one of {', '.join(OBSERVATIONS)}")
+        if render_mode not in (None, *self.metadata["render_modes"]):
+            raise ValueError(f"unknown render_mode {render_mode!r}; choose one of {self.metadata['render_modes']} or None")
+        self.config = merge_config(self.default_config(), config or {})
+        physics, policy = self.config["physics_frequency"], self.config["policy_frequency"]
+        if physics % policy:
+            raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
+        self.render_mode = render_mode
+        self.controls = Controls(*(self.config[name] for name in Controls.__dataclass_fields__))
+        self.observation: Observation = OBSERVATIONS[observation](self.config)
+        self.observation_space = self.observation.space
+        self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self._visits: Counter[tuple[int, int]] = Counter()
+        self._window: Any = None
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """
+        Configuration of this scenario, with units in SI.
+
+        :return: a new dictionary; subclasses update ``super()``'s
+        """
+        return {
+            "duration": 40.0,
+            "policy_frequency": 5,
+            "physics_frequency": 10,
+            "target_speed": 25.0,
+            "max_speed": 30.0,
+            "max_acceleration": 3.0,
+            "max_braking": 6.0,
+            "max_wheel_angle": 0.5,
+            "max_lateral_acceleration": 4.0,
+            "reward_weights": {"velocity": 0.7, "lane": 0.2, "orientation": 0.1, "exploration": 0.0},
+            "velocity_sharpness": 0.2,
+            "orientation_sharpness": 5.0,
+            "lane_tolerance": 2.0,
+            "exploration_decay": 0.1,
+            "graded_cost": False,
+            "graded_cost_ttc": 1.5,
+            "image_shape": (64, 64),
+            "metres_per_pixel": (1.25, 0.4),
+            "ahead": 0.775,
+            "frame": "lane",
+            "neighbours": 8,
+        }
+
+    def _make_road(self) -> Road:
+        """Build the road; drawn anew at every reset."""
+        raise NotImplementedError
+
+    def _make_traffic(self) -> Traffic:
+        """Place the ego vehicle (first) and all others on ``self.road``."""
+        raise NotImplementedError
+
+    def _before_physics(self) -> None:
+        """Events of this scenario, called once per decision."""
+
+    def _progress(self) -> float:
+        """Position of the ego vehicle along the route [m]."""
+        raise NotImplementedError
+
+    def _ran_red_light(self) -> bool:
+        """Whether the ego vehicle crossed a red light's stop line in this step."""
+        return False
+
+    def _is_success(self) -> bool:
+        """Whether the route's end is reached."""
+        return self._progress() >= self.route_length
+
+    def _is_terminated(self) -> bool:
+        """Whether the episode ends in a terminal state."""
+        return self.crashed or self._is_success()
+
+    def _is_truncated(self) -> bool:
+        """Whether time is up."""
+        return self.episode.steps >= round(self.config["duration"] * self.config["policy_frequency"])
+
+    @property
+    def heading_error(self) -> float:
+        """Angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
+        angle = self.traffic.heading[EGO] - self.road.heading[self.traffic.lane[EGO]]
+        return float((angle + math.pi) % (2 * math.pi) - math.pi)
+
+    @property
+    def remaining(self) -> float:
+        """Share of the route that lies ahead, within [0, 1]."""
+        return min(max(1.0 - self._progress() / self.route_length, 0.0), 1.0)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        Draw a new episode.
+
+        :param seed: starts the random numbers, and the count of visited regions, anew
+        :param options: none are known
+        :return: the first observation, and an info with ``speed`` and ``crashed``
+        """
+        super().reset(seed=seed)
+        if seed is not None:
+            self._visits.clear()
+        self.road = self._make_road()
+        self.traffic = self._make_traffic()
+        self.episode = Episode(self.route_length)
+        self.crashed = False
+        self.off_road = False
+        return self.observation.observe(self), self._state()
+
+    def step(self, action: NDArray[np.floating]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        """
+        Drive for one decision interval.
+
+        :param action: acceleration and steering, shape ``(2,)``; clipped to [-1, 1]
+        :return: observation, reward, terminated, truncated, info
+        :raises ValueError: if the action has another shape or is not finite
+        """
+        action = np.asarray(action)
+        if action.shape != (2,) or not np.isfinite(action).all():
+            raise ValueError(f"action {action} is not two finite numbers; give acceleration and steering in [-1, 1]")
+        self._drive(np.clip(action, -1.0, 1.0))
+        terms = self._reward_terms()
+        reward = sum(self.config["reward_weights"][name] * value for name, value in terms.items())
+        cost_terms = self._cost_terms()
+        ttc = time_to_collision(self.traffic)
+        cost = float(any(cost_terms.values())) + self._graded_cost(ttc)
+        self.episode.add_outcome(reward, cost, ttc)
+        terminated = self._is_terminated()
+        truncated = not terminated and self._is_truncated()
+        info = {"cost": cost, "cost_terms": cost_terms, "rewards": terms, **self._state()}
+        if terminated or truncated:
+            info.update(self._verdict())
+        if self.render_mode == "human":
+            self.render()
+        return self.observation.observe(self), reward, terminated, truncated, info
+
+    def _state(self) -> dict[str, Any]:
+        return {"speed": float(self.traffic.speed[EGO]), "crashed": self.crashed}
+
+    def _verdict(self) -> dict[str, Any]:
+        success = self._is_success() and not self.crashed
+        return {"is_success": success, "driving": self.episode.record(success)}
+
+    def _drive(self, action: NDArray[np.floating]) -> None:
+        traffic, frequency = self.traffic, self.config["physics_frequency"]
+        dt, metres, duration = 1.0 / frequency, 0.0, 0.0
+        self._before_physics()
+        for _ in range(frequency // self.config["policy_frequency"]):
+            speed = float(traffic.speed[EGO])
+            acceleration, traffic.wheel_angle[EGO] = self.controls.decode(action, speed)
+            traffic.acceleration[EGO] = self.controls.limit(acceleration, speed, dt)
+            traffic.act()
+            traffic.move(dt)
+            metres, duration = metres + speed * dt, duration + dt
+            self._check_crash()
+            if self.crashed:
+                break
+        on_route = bool(self.road.on_route[traffic.lane[EGO]]) and not self._wrong_way()
+        self.episode.add_motion(duration, metres, self._progress(), on_route)
+
+    def _check_crash(self) -> None:
+        hit = users_hit(self.traffic)
+        self.off_road = is_off_road(self.road, self.traffic)
+        if hit.size:
+            self.episode.add_infraction(Kind(self.traffic.kind[hit[0]]).name.lower())
+        elif self.off_road:
+            self.episode.add_infraction("static")
+        self.crashed = bool(hit.size) or self.off_road
+
+    def _wrong_way(self) -> bool:
+        return abs(self.heading_error) > math.pi / 2
+
+    def _cost_terms(self) -> dict[str, bool]:
+        red_light = self._ran_red_light()
+        if red_light:
+            self.episode.add_infraction("red_light")
+        return {
+            "collision": self.crashed,
+            "off_road": self.off_road,
+            "wrong_way": self._wrong_way(),
+            "red_light": red_light,
+        }
+
+    def _graded_cost(self, ttc: float) -> float:
+        return max(1.0 - ttc / self.config["graded_cost_ttc"], 0.0) if self.config["graded_cost"] else 0.0
+
+    def _reward_terms(self) -> dict[str, float]:
+        config, traffic = self.config, self.traffic
+        lane, target = int(traffic.lane[EGO]), config["target_speed"]
+        along_route = float(traffic.speed[EGO]) * math.cos(self.heading_error)
+        share = rewards.progress_share(along_route, target)
+        region = (lane, int(self._progress() // REGION_LENGTH))
+        visits = self._visits[region]
+        self._visits[region] += 1
+        offset = float(traffic.across[lane, EGO])
+        return {
+            "velocity": rewards.velocity_reward(along_route, target, config["velocity_sharpness"]),
+            "lane": rewards.lane_reward(offset, config["lane_tolerance"]) * share,
+            "orientation": rewards.orientation_reward(self.heading_error, config["orientation_sharpness"]) * share,
+            "exploration": rewards.exploration_reward(visits, config["exploration_decay"]),
+        }
+
+    def render(self) -> NDArray[np.uint8] | None:
+        """
+        Draw the scene for people.
+
+        :return: in mode ``"rgb_array"`` a picture, shape ``(rows, columns, 3)``; in mode ``"human"`` None, after showing it
+        """
+        from sb3_esad.envs.drawing import Window, draw_scene
+
+        if self.render_mode is None:
+            return None
+        picture = draw_scene(self)
+        if self.render_mode == "rgb_array":
+            return picture
+        self._window = self._window or Window(self.metadata["render_fps"])
+        self._window.show(picture)
+        return None
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        if self._window is not None:
+            self._window.close()
+            self._window = None

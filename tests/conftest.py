@@ -1,0 +1,54 @@
+"""Fixtures and worlds with known answers."""
+
+from collections.abc import Iterator
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.utils import set_random_seed
+
+th.set_num_threads(1)
+
+
+@pytest.fixture(autouse=True)
+def seed() -> Iterator[int]:
+    """The same random numbers for every test, whichever ran before."""
+    set_random_seed(0)
+    yield 0
+
+
+class CountingEnv(gym.Env):
+    """
+    The observation is the number of the step, and multiples of 3 cost 1.
+
+    :param episode_length: steps of an episode, which ends in a terminal state
+    :param time_limit: steps after which the episode is truncated instead
+    :param start: first observation, to tell environments apart
+    """
+
+    observation_space: spaces.Space = spaces.Box(0.0, 1e6, (1,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, episode_length: int = 7, time_limit: int = 1000, start: int = 0) -> None:
+        self.episode_length = episode_length
+        self.time_limit = time_limit
+        self.start = start
+        self.count = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.count = 0
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.count += 1
+        terminated = self.count >= self.episode_length
+        truncated = self.count >= self.time_limit
+        info = {"cost": float(self.count % 3 == 0)}
+        return self._observe(), float(self.count), terminated, truncated, info
+
+    def _observe(self) -> Any:
+        return np.array([self.start + self.count], dtype=np.float32)

@@ -1,0 +1,378 @@
+"""Every registered scenario is a well-behaved environment; the highway can be solved and is not trivial."""
+
+import pickle
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.vec_env import SubprocVecEnv
+
+import sb3_esad.envs
+from sb3_esad.envs import rewards
+from sb3_esad.envs.drivers import CarFollower, RandomDriver, ReferenceDriver, SpeedKeeper
+from sb3_esad.envs.geometry import box_corners, boxes_overlap
+from sb3_esad.envs.highway import Highway
+from sb3_esad.envs.metrics import DrivingMetrics, summarise
+from sb3_esad.envs.roads import LANE_WIDTH
+from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.users import Kind, User
+from sb3_esad.envs.vehicle import Controls
+
+IDS = [f"esad-highway{suffix}-v0" for suffix in ("", "-vector", "-dict")]
+HOLD = np.zeros(2, np.float32)
+
+
+def make(env_id: str = IDS[0], **kwargs: Any) -> Any:
+    """The scenario itself, without gymnasium's wrappers."""
+    return gymnasium.make(env_id, **kwargs).unwrapped
+
+
+def alone(speed: float = 25.0, y: float = 4.0, heading: float = 0.0, x: float = 0.0, others: tuple[User, ...] = ()) -> Any:
+    """A highway with nobody else on it, or only those given."""
+    env = make()
+    env.reset(seed=0)
+    env.traffic = Traffic(env.road, [User((x, y), heading, speed, 25.0, drives=False), *others])
+    return env
+
+
+def play(env: Any, actions: np.ndarray) -> list[Any]:
+    """Everything that a rollout returns, as bytes and plain values."""
+    seen: list[Any] = []
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        arrays = observation.values() if isinstance(observation, dict) else [observation]
+        seen.append(([array.tobytes() for array in arrays], reward, terminated, truncated, repr(info)))
+        if terminated or truncated:
+            break
+    return seen
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_checkers_are_content(env_id: str) -> None:
+    check_env(make(env_id), skip_render_check=True)
+    check_sb3_env(gymnasium.make(env_id))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_same_seed_same_episode_to_the_bit(env_id: str) -> None:
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (80, 2)).astype(np.float32)
+    env, other = make(env_id), make(env_id)
+    env.reset(seed=1)
+    play(env, actions)
+    env.reset(seed=7)
+    other.reset(seed=7)
+    first, second = play(env, actions), play(other, actions)
+    assert len(first) > 10
+    assert first == second
+    other.reset(seed=8)
+    assert play(other, actions) != first
+
+
+def test_episodes_differ_without_a_seed() -> None:
+    env = make()
+    first, _ = env.reset(seed=3)
+    second, _ = env.reset()
+    assert not np.array_equal(first, second)
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_pickling_in_mid_episode(env_id: str) -> None:
+    actions = np.random.default_rng(1).uniform(-0.3, 0.3, (60, 2)).astype(np.float32)
+    env = make(env_id)
+    env.reset(seed=5)
+    play(env, actions[:20])
+    copy = pickle.loads(pickle.dumps(env))
+    assert play(copy, actions[20:]) == play(env, actions[20:])
+
+
+def test_subprocesses() -> None:
+    venv = make_vec_env(f"sb3_esad.envs:{IDS[2]}", n_envs=2, seed=0, vec_env_cls=SubprocVecEnv)
+    observation = venv.reset()
+    assert observation["image"].shape == (2, 3, 64, 64)
+    _, _, _, infos = venv.step(np.zeros((2, 2)))
+    assert all("cost" in info for info in infos)
+    venv.close()
+
+
+def test_importing_loads_no_simulator_and_no_window() -> None:
+    code = "import sys, sb3_esad.envs; print({'pygame', 'highway_env', 'cv2', 'torch'} & set(sys.modules) or 'nothing')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert sb3_esad.envs.__file__
+    if "torch" not in done.stdout:  # the package itself may load torch, its envs do not
+        assert done.stdout.strip() == "nothing"
+
+
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        ({"durration": 3}, "did you mean 'duration'"),
+        ({"reward_weights": {"velocty": 1.0}}, "did you mean 'velocity'"),
+        ({"frame": "world"}, "choose one of lane, ego"),
+        ({"physics_frequency": 7}, "no multiple"),
+    ],
+)
+def test_wrong_configurations_are_named(config: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make(config=config)
+
+
+def test_wrong_arguments_are_named() -> None:
+    with pytest.raises(ValueError, match="unknown observation 'sound'"):
+        make(observation="sound")
+    with pytest.raises(ValueError, match="unknown render_mode"):
+        Highway(render_mode="ansi")
+    env = make()
+    env.reset(seed=0)
+    for action in (np.zeros(3), np.array([np.nan, 0.0])):
+        with pytest.raises(ValueError, match="two finite numbers"):
+            env.step(action)
+
+
+def test_configuration_overrides_keep_the_rest() -> None:
+    env = make(IDS[1], config={"duration": 2.0, "reward_weights": {"exploration": 0.5}})
+    assert env.config["reward_weights"]["velocity"] == 0.7
+    env.reset(seed=0)
+    steps = play(env, np.zeros((50, 2), np.float32))
+    assert len(steps) == 10
+    assert steps[-1][2:4] == (False, True)
+
+
+def test_the_image_is_never_blank_and_shows_the_ego_vehicle() -> None:
+    env = make()
+    for seed in range(10):
+        image, _ = env.reset(seed=seed)
+        assert image[0].max() > 150
+        assert image[2, 48:51, 30:34].min() > 90
+        assert image[1].max() > 0 or seed
+
+
+def test_lane_frame_and_ego_frame() -> None:
+    images = {}
+    for frame in ("lane", "ego"):
+        env = make(config={"frame": frame})
+        env.reset(seed=0)
+        env.traffic = Traffic(env.road, [User((50.0, 4.0), 0.2, 25.0, drives=False)])
+        images[frame] = env.observation.observe(env)
+    rows = {frame: image[0].astype(float).std(0).mean() for frame, image in images.items()}
+    assert rows["lane"] < rows["ego"], "along its columns a road aligned with the lane changes little"
+
+
+def test_vector_by_hand() -> None:
+    env = make(IDS[1])
+    env.reset(seed=0)
+    lanes = env.lanes
+    others = [User((30.0, 8.0), 0.0, 10.0), User((-10.0, 4.0), 0.1, 25.0), User((300.0, 0.0), 0.0, 25.0)]
+    env.traffic = Traffic(env.road, [User((0.0, 4.5), 0.0, 25.0, drives=False), *others])
+    vector = env.observation.observe(env)
+    assert vector[:6] == pytest.approx([25 / 30, 0.0, 0.25, 1.0, 6.5 / 16, (lanes * LANE_WIDTH - 6.5) / 16])
+    users = vector[6:].reshape(8, 7)
+    assert users[0, :5] == pytest.approx([1, -0.1, -0.5 / 16, (25 * np.cos(0.1) - 25) / 30, 25 * np.sin(0.1) / 30], abs=1e-6)
+    assert users[0, 5:] == pytest.approx([np.cos(0.1), np.sin(0.1)])
+    assert users[1] == pytest.approx([1, 0.3, 3.5 / 16, -0.5, 0, 1, 0])
+    assert not users[2:].any(), "the third is too far away"
+
+
+def test_holding_speed_and_lane_alone_is_perfect() -> None:
+    env = alone()
+    total = 0.0
+    for _ in range(121):
+        _, reward, terminated, truncated, info = env.step(HOLD)
+        assert reward == pytest.approx(1.0)
+        assert info["cost"] == 0.0
+        total += reward
+        if terminated or truncated:
+            break
+    assert terminated
+    assert not truncated
+    assert info["is_success"]
+    assert info["driving"]["driving_score"] == 1.0
+    assert info["driving"]["return"] == pytest.approx(total)
+    assert info["driving"]["distance"] == pytest.approx(600.0, abs=5.0)
+
+
+def test_speed_and_acceleration_limits() -> None:
+    env = alone(speed=25.0)
+    for _ in range(15):
+        env.step(np.array([1.0, 0.0]))
+    assert env.traffic.speed[EGO] == pytest.approx(30.0)
+    _, _, _, _, info = env.step(np.array([-1.0, 0.0]))
+    assert info["speed"] == pytest.approx(30.0 - 6.0 * 0.2)
+    for _ in range(60):
+        env.step(np.array([-1.0, 0.0]))
+    assert env.traffic.speed[EGO] == 0.0
+
+
+@pytest.mark.parametrize("speed", [3.0, 10.0, 20.0, 30.0])
+def test_steering_is_limited_by_wheel_angle_and_lateral_acceleration(speed: float) -> None:
+    controls = Controls(3.0, 6.0, 0.5, 4.0, 30.0)
+    _, angle = controls.decode(np.array([0.0, 1.0]), speed)
+    yaw_rate = speed * np.sin(np.arctan(0.5 * np.tan(angle))) / 2.5
+    assert angle <= 0.5 + 1e-9
+    assert yaw_rate * speed <= 4.0 + 1e-9
+    assert angle == pytest.approx(0.5) or yaw_rate * speed == pytest.approx(4.0)
+
+
+@given(pedal=st.floats(-1, 1), wheel=st.floats(-1, 1), speed=st.floats(0, 30))
+@settings(max_examples=100, deadline=None)
+def test_encode_inverts_decode(pedal: float, wheel: float, speed: float) -> None:
+    controls = Controls(3.0, 6.0, 0.5, 4.0, 30.0)
+    action = np.array([pedal, wheel])
+    np.testing.assert_allclose(controls.encode(*controls.decode(action, speed), speed), action, atol=1e-6)
+
+
+def test_leaving_the_road_is_a_collision_with_the_barrier() -> None:
+    env = alone(y=0.0, heading=-0.1)
+    while True:
+        _, _, terminated, truncated, info = env.step(HOLD)
+        if terminated or truncated:
+            break
+    assert terminated
+    assert info["crashed"]
+    assert info["cost"] == 1.0
+    assert info["cost_terms"] == {"collision": True, "off_road": True, "wrong_way": False, "red_light": False}
+    assert info["driving"]["infractions_static"] == 1.0
+    assert not info["is_success"]
+
+
+@pytest.mark.parametrize(("kind", "name"), [(Kind.VEHICLE, "vehicle"), (Kind.STATIC, "static"), (Kind.PERSON, "person")])
+def test_hitting_something_ends_the_episode_and_is_named(kind: Kind, name: str) -> None:
+    env = alone(others=(User((40.0, 4.0), kind=kind, drives=False),))
+    terminated = False
+    while not terminated:
+        _, _, terminated, _, info = env.step(HOLD)
+        assert info["cost"] == float(terminated)
+    assert env.episode.time == pytest.approx(1.4, abs=0.11), "35 m at 25 m/s"
+    assert info["driving"][f"infractions_{name}"] == 1.0
+    assert info["driving"]["infractions"] == 1.0
+
+
+def test_wrong_way_and_ramp() -> None:
+    env = alone(speed=5.0, x=100.0, heading=np.pi)
+    _, reward, _, _, info = env.step(HOLD)
+    assert info["cost_terms"]["wrong_way"]
+    assert info["rewards"]["velocity"] == info["rewards"]["lane"] == info["rewards"]["orientation"] == 0.0
+    assert reward == 0.0
+    env = alone(speed=20.0, x=float(env.road.start[env.lanes, 0]) + 20.0, y=LANE_WIDTH * env.lanes)
+    env.step(HOLD)
+    assert env.episode.off_route == pytest.approx(4.0)
+
+
+def test_graded_cost_rises_before_the_crash() -> None:
+    env = make(config={"graded_cost": True})
+    env.reset(seed=0)
+    other = User((50.0, 4.0), kind=Kind.STATIC, drives=False, size=(5.0, 2.0))
+    env.traffic = Traffic(env.road, [User((0.0, 4.0), 0.0, 25.0, drives=False), other])
+    costs = []
+    for _ in range(20):
+        _, _, terminated, _, info = env.step(HOLD)
+        costs.append(info["cost"])
+        if terminated:
+            break
+    assert costs[0] == 0.0
+    assert costs[3] == pytest.approx(1 - (45 - 20) / 25 / 1.5)
+    assert costs == sorted(costs)
+    assert costs[-1] == pytest.approx(2.0, abs=0.1)
+
+
+def test_reward_terms_by_hand() -> None:
+    assert rewards.velocity_reward(25.0, 25.0, 0.2) == 1.0
+    assert rewards.velocity_reward(0.0, 25.0, 0.2) == rewards.velocity_reward(-9.0, 25.0, 0.2) == 0.0
+    assert rewards.velocity_reward(20.0, 25.0, 0.2) == pytest.approx((1 / 2 - 1 / 6) / (1 - 1 / 6))
+    assert rewards.velocity_reward(30.0, 25.0, 0.2) == pytest.approx(0.4)
+    assert rewards.lane_reward(0.0, 2.0) == 1.0
+    assert rewards.lane_reward(-0.5, 2.0) == pytest.approx(0.75)
+    assert rewards.lane_reward(2.1, 2.0) == -1.0
+    assert rewards.orientation_reward(-0.2, 5.0) == pytest.approx(0.5)
+    assert rewards.exploration_reward(0, 0.1) == 1.0
+    assert rewards.exploration_reward(10, 0.1) == pytest.approx(np.exp(-1))
+    assert rewards.progress_share(-3.0, 25.0) == 0.0
+    assert rewards.progress_share(30.0, 25.0) == 1.0
+
+
+def test_parking_pays_nothing_and_exploration_wears_off() -> None:
+    env = alone(speed=0.0)
+    explored = []
+    for _ in range(5):
+        _, reward, _, _, info = env.step(HOLD)
+        explored.append(info["rewards"]["exploration"])
+        assert reward == 0.0
+    assert explored == pytest.approx(np.exp(-0.1 * np.arange(5)))
+
+
+def brute_force_overlap(first: np.ndarray, second: np.ndarray) -> bool:
+    """Whether a fine grid of points on one box, edges included, has a point in the other."""
+    u, v = np.meshgrid(np.linspace(0, 1, 60), np.linspace(0, 1, 60))
+    points = first[0] + u[..., None] * (first[1] - first[0]) + v[..., None] * (first[3] - first[0])
+    inside = np.ones(u.shape, bool)
+    for i in range(4):
+        edge = second[(i + 1) % 4] - second[i]
+        offset = points - second[i]
+        inside &= edge[0] * offset[..., 1] - edge[1] * offset[..., 0] >= 0
+    return bool(inside.any())
+
+
+@given(
+    place=st.tuples(st.floats(-7, 7), st.floats(-7, 7)), turns=st.tuples(st.floats(-4, 4), st.floats(-4, 4)),
+    size=st.tuples(st.floats(0.5, 6), st.floats(0.5, 3)),
+)  # fmt: skip
+@settings(max_examples=150, deadline=None)
+def test_overlap_equals_brute_force(place: tuple[float, float], turns: tuple[float, float], size: tuple[float, float]) -> None:
+    def boxes(growth: float) -> np.ndarray:
+        return box_corners(np.array([(0.0, 0.0), place]), np.array(turns), np.array([(5.0, 2.0), size]) + growth)
+
+    exact, smaller, larger = boxes(0.0), boxes(-0.25), boxes(0.25)
+    found = boxes_overlap(exact[0], exact[1:])[0]
+    if brute_force_overlap(smaller[1], smaller[0]):
+        assert found
+    if not brute_force_overlap(larger[1], larger[0]) and not brute_force_overlap(larger[0], larger[1]):
+        assert not found
+
+
+def test_render_shows_a_picture() -> None:
+    env = make(render_mode="rgb_array")
+    env.reset(seed=0)
+    picture = env.render()
+    assert picture.shape == (320, 960, 3)
+    assert picture.dtype == np.uint8
+    assert len(np.unique(picture.reshape(-1, 3), axis=0)) > 20
+    assert make().render() is None
+
+
+def evaluate(driver: Callable[[Any], np.ndarray], seeds: int) -> dict[str, float]:
+    """Figures of a scripted driver."""
+    env = DrivingMetrics(gymnasium.make(IDS[1]))
+    for seed in range(seeds):
+        env.reset(seed=seed)
+        done = False
+        while not done:
+            _, _, terminated, truncated, _ = env.step(driver(env))
+            done = terminated or truncated
+    return summarise(env.records)
+
+
+def test_highway_can_be_solved_and_is_not_trivial() -> None:
+    reference, follower, keeper, chance = (
+        evaluate(driver, 30) for driver in (ReferenceDriver(), CarFollower(), SpeedKeeper(), RandomDriver(0))
+    )
+    assert reference["DS"] >= 95
+    assert reference["collision_free"] >= 0.97
+    assert reference["speed"] > 20.5
+    assert follower["collision_free"] >= 0.95
+    assert follower["speed"] > 19.5
+    assert keeper["DS"] <= reference["DS"] - 25
+    assert keeper["DS"] <= 75
+    assert chance["DS"] < 25
+
+
+def test_scripted_drivers_want_a_scenario() -> None:
+    with pytest.raises(TypeError, match="no driving scenario"):
+        SpeedKeeper()(gymnasium.make("CartPole-v1"))

@@ -1,0 +1,194 @@
+"""Every figure of the metrics on episodes whose values were worked out by hand."""
+
+import math
+
+import gymnasium
+import numpy as np
+import pytest
+
+from sb3_esad.envs.hazards import time_to_collision
+from sb3_esad.envs.highway import highway_road
+from sb3_esad.envs.metrics import (
+    LONGEST_TTC,
+    DrivingMetrics,
+    Episode,
+    format_header,
+    format_row,
+    mean_interval,
+    summarise,
+    wilson_interval,
+    worst_mean,
+)
+from sb3_esad.envs.traffic import Traffic
+from sb3_esad.envs.users import Kind, User
+
+ROAD = highway_road(3, 600.0, 200.0, 150.0)
+
+
+def perfect() -> Episode:
+    """100 m in 5 s along a route of 100 m, reward 1 a second."""
+    episode = Episode(100.0)
+    for second in range(5):
+        episode.add_motion(1.0, 20.0, 20.0 * (second + 1), on_route=True)
+        episode.add_outcome(1.0, 0.0, math.inf)
+    return episode
+
+
+def crash() -> Episode:
+    """40 of 100 m in 2 s, then into a car; the smallest time to collision was 0.5 s."""
+    episode = Episode(100.0)
+    for progress, ttc, cost in ((20.0, 3.0, 0.0), (40.0, 0.5, 1.0)):
+        episode.add_motion(1.0, 20.0, progress, on_route=True)
+        episode.add_outcome(0.5, cost, ttc)
+    episode.add_infraction("vehicle")
+    return episode
+
+
+def sinner() -> Episode:
+    """60 m in 6 s, 10 of them off the route, over two red lights and into a person."""
+    episode = Episode(100.0)
+    for second in range(6):
+        episode.add_motion(1.0, 10.0, 10.0 * (second + 1), on_route=second != 2)
+        episode.add_outcome(0.0, float(second in (3, 4, 5)), 2.0)
+    for name in ("red_light", "red_light", "person"):
+        episode.add_infraction(name)
+    return episode
+
+
+def test_records_by_hand() -> None:
+    good, bad, worst = perfect().record(True), crash().record(False), sinner().record(False)
+    assert (good["route_completion"], good["infraction_score"], good["driving_score"]) == (1.0, 1.0, 1.0)
+    assert (bad["route_completion"], bad["infraction_score"]) == (0.4, 0.6)
+    assert bad["driving_score"] == pytest.approx(0.24)
+    assert worst["route_completion"] == pytest.approx(0.5), "the 10 m off the route are taken off"
+    assert worst["infraction_score"] == pytest.approx(0.7 * 0.7 * 0.5)
+    assert (good["min_ttc"], bad["min_ttc"], worst["min_ttc"]) == (LONGEST_TTC, 0.5, 2.0)
+    assert (good["mean_speed"], bad["mean_speed"], worst["mean_speed"]) == (20.0, 20.0, 10.0)
+    assert (good["collisions"], bad["collisions"], worst["collisions"]) == (0.0, 1.0, 1.0)
+    assert (good["infractions"], bad["infractions"], worst["infractions"]) == (0.0, 1.0, 3.0)
+    assert (good["return"], bad["return"], bad["cost"], worst["cost"]) == (5.0, 1.0, 1.0, 3.0)
+    assert all(type(value) is float for record in (good, bad, worst) for value in record.values())
+
+
+def test_static_penalty() -> None:
+    episode = perfect()
+    episode.add_infraction("static")
+    assert episode.record(False)["driving_score"] == pytest.approx(0.65)
+
+
+def test_going_back_does_not_undo_progress_and_more_than_the_route_is_no_bonus() -> None:
+    episode = Episode(100.0)
+    for progress in (50.0, 120.0, 70.0):
+        episode.add_motion(1.0, 50.0, progress, on_route=True)
+    assert episode.record(True)["route_completion"] == 1.0
+
+
+def test_summary_by_hand() -> None:
+    figures = summarise([perfect().record(True), crash().record(False), sinner().record(False)])
+    assert figures["DS"] == pytest.approx(100 * (1 + 0.24 + 0.5 * 0.245) / 3)
+    assert figures["RC"] == pytest.approx(100 * (1 + 0.4 + 0.5) / 3)
+    assert figures["IS"] == pytest.approx(100 * (1 + 0.6 + 0.245) / 3)
+    assert figures["CR"] == pytest.approx(2 / 0.2), "2 collisions in 200 m"
+    assert figures["CO"] == pytest.approx(2 / 2), "the same per 100 m"
+    assert figures["IPK"] == pytest.approx(4 / 0.2)
+    assert figures["TTC"] == pytest.approx((LONGEST_TTC + 0.5 + 2.0) / 3)
+    assert figures["TTC_5"] == pytest.approx(np.percentile([LONGEST_TTC, 0.5, 2.0], 5)) == pytest.approx(0.65)
+    assert figures["success"] == pytest.approx(1 / 3)
+    assert figures["collision_free"] == pytest.approx(1 / 3)
+    assert figures["speed"] == pytest.approx(50 / 3)
+    assert figures["return"] == pytest.approx(2.0)
+    assert figures["cost"] == pytest.approx(4 / 3)
+    assert figures["cost_cvar"] == 3.0
+    assert figures["DS_low"] < figures["DS"] < figures["DS_high"]
+
+
+def test_no_records_is_an_error() -> None:
+    with pytest.raises(ValueError, match="at least one episode"):
+        summarise([])
+
+
+def test_wilson_interval_by_hand() -> None:
+    assert wilson_interval(0, 10) == pytest.approx((0.0, 0.2775), abs=1e-4)
+    assert wilson_interval(5, 10) == pytest.approx((0.2366, 0.7634), abs=1e-4)
+    assert wilson_interval(97, 100) == pytest.approx((0.9155, 0.9897), abs=1e-4)
+    low, high = wilson_interval(10, 10)
+    assert (low, high) == pytest.approx((0.7225, 1.0), abs=1e-4)
+
+
+def test_mean_interval_by_hand() -> None:
+    low, high = mean_interval(np.array([1.0, 2.0, 3.0]))
+    assert (low, high) == pytest.approx((2 - 4.3027 / math.sqrt(3), 2 + 4.3027 / math.sqrt(3)), abs=1e-3)
+    assert mean_interval(np.array([7.0])) == (7.0, 7.0)
+
+
+def test_worst_mean_by_hand() -> None:
+    costs = np.arange(20.0)
+    assert worst_mean(costs, 0.1) == 18.5
+    assert worst_mean(costs, 0.25) == 17.0
+    assert worst_mean(costs, 1.0) == 9.5
+    assert worst_mean(np.array([3.0]), 0.1) == 3.0
+
+
+@pytest.mark.parametrize(
+    ("place", "heading", "speed", "expected"),
+    [
+        ((65.0, 4.0), 0.0, 15.0, 1.0),  # 15 m between centres, 10 m between bumpers, closing at 10 m/s
+        ((65.0, 4.0), 0.0, 25.0, math.inf),  # as fast
+        ((35.0, 4.0), 0.0, 40.0, math.inf),  # from behind: not in the path
+        ((65.0, 6.5), 0.0, 15.0, math.inf),  # half a metre of room beside it
+        ((65.0, 5.5), 0.0, 15.0, 1.0),  # half a metre of overlap
+        ((65.0, 4.0), math.pi, 15.0, 10.0 / 40.0),  # oncoming
+    ],
+)
+def test_time_to_collision_by_hand(place: tuple[float, float], heading: float, speed: float, expected: float) -> None:
+    users = [User((50.0, 4.0), 0.0, 25.0, drives=False), User(place, heading, speed)]
+    assert time_to_collision(Traffic(ROAD, users)) == pytest.approx(expected)
+
+
+def test_time_to_collision_takes_the_nearest_and_never_falls_below_zero() -> None:
+    users = [
+        User((50.0, 4.0), 0.0, 25.0, drives=False),
+        User((95.0, 4.0), kind=Kind.STATIC, size=(5.0, 2.0)),
+        User((65.0, 4.0), 0.0, 15.0),
+    ]
+    assert time_to_collision(Traffic(ROAD, users)) == pytest.approx(1.0)
+    assert time_to_collision(Traffic(ROAD, [users[0], User((54.0, 4.0), 0.0, 15.0)])) == 0.0
+
+
+class OneStep(gymnasium.Env):
+    """Ends at the first step, with whatever info it was given."""
+
+    observation_space = gymnasium.spaces.Discrete(1)
+    action_space = gymnasium.spaces.Discrete(1)
+
+    def __init__(self, info: dict) -> None:
+        self.info = info
+
+    def reset(self, *, seed: int | None = None, options: dict | None = None) -> tuple[int, dict]:
+        return 0, {}
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict]:
+        return 0, 0.0, False, True, self.info
+
+
+def test_wrapper_keeps_the_records() -> None:
+    env = DrivingMetrics(OneStep({"driving": perfect().record(True)}))
+    for _ in range(3):
+        env.reset()
+        env.step(0)
+    assert len(env.records) == 3
+    assert summarise(env.records)["DS"] == 100.0
+
+
+def test_wrapper_says_what_is_missing() -> None:
+    env = DrivingMetrics(OneStep({}))
+    env.reset()
+    with pytest.raises(KeyError, match="wrap a scenario"):
+        env.step(0)
+
+
+def test_rows_fit_the_header() -> None:
+    row = format_row("reference", summarise([perfect().record(True)]))
+    head, rule = format_header().splitlines()
+    assert head.count("|") == row.count("|") == rule.count("|")
+    assert "100.0 [100.0, 100.0]" in row

@@ -1,0 +1,320 @@
+"""Penalties, their multiplier and the entropy coefficient."""
+
+import warnings
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_esad.common.entropy import FixedCoefficient, LearnedCoefficient, make_entropy_coefficient
+from sb3_esad.common.episode_record import EpisodeRecord
+from sb3_esad.common.functional import discounted_budget
+from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
+
+
+def make_penalty(**kwargs: Any) -> AugmentedLagrangian:
+    defaults: dict[str, Any] = {"cost_limit": 1.0, "cost_gamma": 1.0, "risk_level": 1.0, "penalty_warmup": 0}
+    return AugmentedLagrangian(**{**defaults, **kwargs})
+
+
+def observe_episodes(penalty: AugmentedLagrangian, cost: float, n: int = 50, length: int = 1) -> None:
+    """Let ``n`` episodes end, each with ``cost`` in its last step."""
+    for _ in range(n):
+        for step in range(length):
+            last = step == length - 1
+            penalty.observe(np.array([cost * last]), np.array([last]))
+
+
+def calibrate(penalty: AugmentedLagrangian, cost: float) -> None:
+    """Make the critics agree with a road on which every episode costs ``cost``."""
+    observe_episodes(penalty, cost)
+    penalty.note_prediction(th.full((4,), cost))
+
+
+@pytest.mark.parametrize(("violation", "expected"), [(0.5, 0.625), (-2.0, -0.5)])
+def test_psi_known_values(violation: float, expected: float) -> None:
+    assert make_penalty()(th.tensor(violation)).item() == pytest.approx(expected)
+
+
+def test_psi_equals_the_two_branches() -> None:
+    for multiplier, coef, scale in 10 ** th.empty(100, 3, dtype=th.float64).uniform_(-1, 1):
+        penalty = make_penalty(penalty_coef=coef.item()).double()
+        penalty.multiplier.copy_(multiplier)
+        g = scale * th.randn(100, dtype=th.float64)
+        textbook = th.where(multiplier + coef * g > 0, multiplier * g + coef * g**2 / 2, -(multiplier**2) / (2 * coef))
+        square = (th.relu(multiplier + coef * g) ** 2 - multiplier**2) / (2 * coef)
+        th.testing.assert_close(penalty(g), textbook)
+        th.testing.assert_close(penalty(g), square)
+
+
+def test_psi_without_proportional_part_is_linear() -> None:
+    penalty = make_penalty(penalty_coef=0.0)
+    g = th.linspace(-5, 5, 11)
+    th.testing.assert_close(penalty(g), g)
+    penalty.multiplier.zero_()
+    th.testing.assert_close(penalty(g), th.zeros(11))
+
+
+@pytest.mark.parametrize(("lambda_lr", "penalty_coef"), [(1.0, 1.0), (0.1, 1.0), (0.5, 2.0), (0.1, 5.0)])
+def test_finds_the_constrained_minimum(lambda_lr: float, penalty_coef: float) -> None:
+    """Min x^2 subject to x >= 1 has x = 1 and the multiplier 2 (Karush, Kuhn, Tucker)."""
+    penalty = make_penalty(lambda_lr=lambda_lr, penalty_coef=penalty_coef, min_episodes=51, window=51)
+    penalty._signals = lambda violation: {"violation_model": violation}  # type: ignore[method-assign]
+    x = th.tensor(0.0)
+    for _ in range(400):
+        x.requires_grad_()
+        (slope,) = th.autograd.grad(x**2 + penalty(1 - x), x)
+        x = (x - slope / (2 + penalty_coef)).detach()  # Newton's step, for the loss is quadratic near the minimum
+        penalty.update(1 - x)
+    assert x.item() == pytest.approx(1.0, abs=1e-3)
+    assert penalty.multiplier.item() == pytest.approx(2.0, abs=5e-3)
+
+
+def test_budget() -> None:
+    penalty = make_penalty(cost_limit=0.05, cost_gamma=0.95, episode_length=40)
+    assert penalty.budget == pytest.approx(discounted_budget(0.05, 0.95, 40)) == pytest.approx(0.0218, abs=1e-4)
+    assert make_penalty(cost_limit=3.0, cost_gamma=1.0).budget == 3.0
+    strict = make_penalty(cost_limit=0.0, cost_gamma=0.9)
+    assert strict.budget == 0.0 and strict.budget_scale == 0.01
+
+
+def test_horizon_follows_cost_free_episodes_only() -> None:
+    penalty = make_penalty(cost_gamma=0.9, episode_length=40)
+    observe_episodes(penalty, cost=1.0, length=3)
+    assert penalty.episodes.episode_length == 40
+    observe_episodes(penalty, cost=0.0, n=500, length=10)
+    assert penalty.episodes.episode_length == pytest.approx(10, abs=0.01)
+
+
+def test_combine() -> None:
+    penalty = make_penalty(barrier_coef=2.0, cost_limit=0.5)
+    objective, risk = th.tensor([1.0, -1.0]), th.tensor([0.5, 0.25], requires_grad=True)
+    barrier = th.tensor([-1.0, 0.25], requires_grad=True)
+    loss = penalty.combine(objective, risk, barrier)
+    th.testing.assert_close(loss, th.tensor([1.5, -1.0 + 2 * 0.25]) / 2.5)
+    loss.sum().backward()
+    assert barrier.grad is None
+    th.testing.assert_close(risk.grad, th.tensor([1.0, 2.0]) / 2.5)
+
+
+def test_weight_never_rewards_cost_nor_exceeds_its_bound() -> None:
+    penalty = make_penalty(penalty_coef=5.0, multiplier_bounds=(0.05, 3.0))
+    penalty.mean_violation.fill_(-1.0)
+    zeros, ones = th.zeros(2), th.ones(2)
+    assert penalty.base_weight.item() == 0.0
+    th.testing.assert_close(penalty.combine(zeros, ones, zeros), zeros)
+    th.testing.assert_close(penalty.combine(zeros, ones, 1e9 * ones), th.full((2,), 3.0 / 4.0))
+
+
+def test_admissible() -> None:
+    penalty = make_penalty(cost_limit=0.0)
+    risk, barrier = th.tensor([0.005, 0.02, 0.005]), th.tensor([0.0, -1.0, 0.1])
+    assert penalty.admissible(risk, barrier).tolist() == [True, False, False]
+
+
+def test_both_signals_move_the_multiplier() -> None:
+    penalty = make_penalty(lambda_lr=0.01)
+    calibrate(penalty, 5.0)
+    for _ in range(100):
+        logs = penalty.update(99.0)
+    assert logs["violation_model"] == logs["violation_road"] == 1.0
+    assert penalty.multiplier.item() == pytest.approx(2.0, abs=1e-4)
+    for _ in range(48):
+        penalty.update(th.tensor(99.0), gradient_steps=101)
+    assert penalty.multiplier.item() == 50.0
+
+
+def test_multiplier_stays_above_its_lower_bound() -> None:
+    penalty = make_penalty(lambda_lr=0.1)
+    calibrate(penalty, 0.0)
+    for _ in range(1000):
+        penalty.update(-99.0)
+    assert penalty.multiplier.item() == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("violation", [1.0, 0.5])
+def test_disagreement_holds_the_multiplier(violation: float) -> None:
+    penalty = make_penalty()
+    calibrate(penalty, 0.0)
+    for _ in range(1000):
+        logs = penalty.update(violation)
+    assert (logs["violation_model"], logs["violation_road"]) == (violation, -1.0)
+    assert penalty.multiplier.item() == 1.0
+    assert penalty.mean_violation.item() == pytest.approx((violation - 1.0) / 2, abs=1e-3)
+
+
+def test_steps_scale_with_gradient_steps() -> None:
+    one, four = make_penalty(), make_penalty()
+    for penalty in (one, four):
+        calibrate(penalty, 5.0)
+    for _ in range(4):
+        one.update(0.5)
+    four.update(0.5, gradient_steps=4)
+    th.testing.assert_close(one.multiplier, four.multiplier)
+    th.testing.assert_close(one.mean_violation, four.mean_violation)
+    th.testing.assert_close(one.n_updates, four.n_updates)
+
+
+def test_uncalibrated_critics_have_no_vote() -> None:
+    penalty = make_penalty()
+    assert "violation_model" not in penalty.update(1.0)
+    observe_episodes(penalty, cost=0.0)
+    assert not penalty.calibrated
+    penalty.note_prediction(th.tensor([]))
+    assert not penalty.calibrated
+    penalty.note_prediction(th.full((3,), 99.0))
+    assert penalty.calibration == pytest.approx(100.0) and not penalty.calibrated
+    assert "violation_model" not in penalty.update(1.0)
+    for _ in range(1000):
+        penalty.note_prediction(th.zeros(3))
+    assert penalty.calibrated and penalty.update(1.0)["violation_model"] == 1.0
+
+
+def test_few_episodes_have_no_vote() -> None:
+    penalty = make_penalty()
+    observe_episodes(penalty, cost=9.0, n=19)
+    penalty.note_prediction(th.tensor([9.0]))
+    assert not penalty.calibrated
+    assert "violation_road" not in penalty.update(1.0)
+    assert penalty.multiplier.item() == 1.0 and penalty.mean_violation.item() == 0.0
+    observe_episodes(penalty, cost=9.0, n=1)
+    assert penalty.update(1.0)["violation_road"] == 1.0
+
+
+def test_warm_up_and_missing_updates_hold_the_multiplier() -> None:
+    penalty = make_penalty(penalty_warmup=10)
+    calibrate(penalty, 5.0)
+    for _ in range(20):
+        penalty.update(None)
+    for _ in range(10):
+        penalty.update(1.0)
+    assert penalty.multiplier.item() == 1.0
+    penalty.update(1.0)
+    assert penalty.multiplier.item() > 1.0
+
+
+def test_road_signal_is_the_tail_of_the_latest_episodes() -> None:
+    record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50)
+    for cost in [100.0] * 30 + [float(c) for c in range(50)]:
+        record.observe(np.array([0.0, 0.0]), np.array([False, False]))
+        record.observe(np.array([cost, 0.0]), np.array([True, False]))
+    assert record.size == 50
+    assert record.tail_cost(1.0) == pytest.approx(24.5)
+    assert record.tail_cost(0.1) == pytest.approx(np.mean([45, 46, 47, 48, 49]))
+    assert record.calibration(1e-9) == pytest.approx(0.0, abs=1e-6)
+    record.note_prediction(th.tensor([12.25]))
+    assert record.calibration(1e-9) == pytest.approx(1.0, rel=1e-4)
+
+
+def test_another_number_of_environments() -> None:
+    penalty = make_penalty()
+    penalty.observe(np.ones(2), np.zeros(2, dtype=bool))
+    penalty.observe(np.ones(3), np.array([True, False, True]))
+    assert penalty.episodes.costs[:2].tolist() == [1.0, 1.0]
+
+
+def test_warns_once_at_the_upper_bound() -> None:
+    penalty = make_penalty(multiplier_init=50.0)
+    calibrate(penalty, 5.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(499):
+            penalty.update(1.0)
+    with pytest.warns(UserWarning, match="upper bound 50.0: cost_limit=1.0 cannot be met"):
+        penalty.update(1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(600):
+            penalty.update(1.0)
+
+
+def test_state_dict_round_trip() -> None:
+    penalty, loaded = make_penalty(), make_penalty()
+    calibrate(penalty, 5.0)
+    for _ in range(30):
+        logs = penalty.update(1.0)
+    state = penalty.state_dict()
+    assert all(entry.dtype == th.float32 and entry.isfinite().all() for entry in state.values())
+    loaded.load_state_dict(state)
+    assert loaded.update(None) == penalty.update(None)
+    assert loaded.calibrated and logs["lagrangian_multiplier"] == loaded.multiplier.item()
+
+
+def test_survives_random_state() -> None:
+    """SB3's save-and-load tests fill every entry with random numbers."""
+    penalty = make_penalty(cost_gamma=0.9)
+    penalty.load_state_dict({name: th.rand_like(entry) for name, entry in penalty.state_dict().items()})
+    observe_episodes(penalty, cost=1.0, n=3)
+    penalty.note_prediction(th.ones(2))
+    assert np.isfinite(list(penalty.update(0.3).values())).all()
+    penalty.load_state_dict({name: th.zeros_like(entry) for name, entry in penalty.state_dict().items()})
+    assert np.isfinite(list(penalty.update(0.3).values())).all()
+
+
+def test_no_penalty_ignores_everything() -> None:
+    penalty = NoPenalty(cost_limit=None, risk_level=0.5)
+    nan, objective = th.full((3,), th.nan), th.arange(3.0)
+    assert penalty(nan).tolist() == [0.0, 0.0, 0.0]
+    assert penalty.combine(objective, nan, nan) is objective
+    assert penalty.admissible(nan, nan).all()
+    penalty.observe(np.ones(2), np.ones(2))
+    penalty.note_prediction(nan)
+    assert penalty.update(float("nan"), gradient_steps=3) == {}
+    assert len(penalty.state_dict()) == 0
+
+
+@pytest.mark.parametrize(
+    ("kwargs", "message"),
+    [
+        ({"cost_limit": -1.0}, "cost_limit is -1.0; choose"),
+        ({"cost_limit": float("nan")}, "cost_limit is nan"),
+        ({"risk_level": 0.0}, "risk_level is 0.0; choose"),
+        ({"risk_level": 1.5}, "risk_level is 1.5; choose"),
+        ({"cost_gamma": 1.5}, "cost_gamma is 1.5; choose"),
+        ({"episode_length": 0}, "episode_length is 0; choose"),
+        ({"penalty_coef": -1.0}, "penalty_coef is -1.0; choose"),
+        ({"lambda_lr": -1.0}, "lambda_lr is -1.0; choose"),
+        ({"barrier_coef": -1.0}, "barrier_coef is -1.0; choose"),
+        ({"multiplier_init": 99.0}, "multiplier_init is 99.0; choose"),
+        ({"multiplier_bounds": (2.0, 1.0)}, "one within 2.0 and 1.0"),
+    ],
+)
+def test_refuses_impossible_settings(kwargs: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        make_penalty(**kwargs)
+
+
+def test_learned_coefficient_reaches_the_target_entropy() -> None:
+    """A Gaussian policy that trades the entropy against a quadratic: its best variance is the coefficient."""
+    coefficient = LearnedCoefficient(target_entropy=0.0, init=0.5, learning_rate=0.01)
+    for _ in range(2000):
+        variance = coefficient()
+        logs = coefficient.update(-0.5 * (2 * th.pi * th.e * variance).log())
+    assert logs["ent_coef"] == pytest.approx(1 / (2 * np.pi * np.e), rel=0.02)
+
+
+@pytest.mark.parametrize(("entropy", "bound"), [(100.0, 1e-4), (-100.0, 1.0)])
+def test_learned_coefficient_keeps_its_bounds(entropy: float, bound: float) -> None:
+    coefficient = LearnedCoefficient(target_entropy=-1.0, init=0.1, learning_rate=0.1)
+    for _ in range(300):
+        coefficient.update(th.full((5,), -entropy))
+    assert coefficient().item() == pytest.approx(bound, rel=1e-5)
+    assert not coefficient().requires_grad
+
+
+def test_make_entropy_coefficient() -> None:
+    automatic, started, fixed = (make_entropy_coefficient(value, -2.0) for value in ("auto", "auto_0.1", 0.2))
+    assert isinstance(automatic, LearnedCoefficient) and automatic().item() == pytest.approx(1.0)
+    assert isinstance(started, LearnedCoefficient) and started().item() == pytest.approx(0.1)
+    assert isinstance(fixed, FixedCoefficient) and fixed().item() == pytest.approx(0.2)
+    assert fixed.update(th.zeros(3)) == {"ent_coef": pytest.approx(0.2)}
+    assert make_entropy_coefficient("0.3", -2.0)().item() == pytest.approx(0.3)
+    for module in (automatic, started, fixed):
+        assert all(hasattr(module, name) for name in module.optimizer_names)
+
+
+@pytest.mark.parametrize("value", ["automatic", "auto_x", "auto_7", "auto_-1", -0.1])
+def test_refuses_unknown_coefficients(value: Any) -> None:
+    with pytest.raises(ValueError, match=r"ent_coef is .*; choose"):
+        make_entropy_coefficient(value, -1.0)
