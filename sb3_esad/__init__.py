@@ -1,1 +1,9 @@
-"""Safe model-based reinforcement learning for Stable-Baselines3."""
+"""Safe model-based reinforcement learning for Stable-Baselines3: ESAD-LEND and what it is compared with."""
+
+from pathlib import Path
+
+import sb3_esad.envs  # noqa: F401  (registers the scenarios)
+from sb3_esad.esad_lend import ESADLEND
+
+__version__ = (Path(__file__).parent / "version.txt").read_text().strip()
+__all__ = ["ESADLEND", "__version__"]

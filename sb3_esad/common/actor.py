@@ -25,7 +25,7 @@ class Actor(nn.Module):
         super().__init__()
         self.action_dim = action_dim
         self.readout = GridReadout(grid_shape, net_arch[0])
-        self.parameters_net = mlp(net_arch[0], net_arch[1:], 2 * action_dim, zero_output=True)
+        self.mean_log_std_net = mlp(net_arch[0], net_arch[1:], 2 * action_dim, zero_output=True)
 
     def forward(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
         """
@@ -35,7 +35,7 @@ class Actor(nn.Module):
         :param deterministic: take the mode instead of a sample
         :return: shape (N, A)
         """
-        return self._distribution().actions_from_params(*self._parameters(state), deterministic=deterministic)
+        return self._distribution().actions_from_params(*self._mean_log_std(state), deterministic=deterministic)
 
     def action_log_prob(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
         """
@@ -44,12 +44,12 @@ class Actor(nn.Module):
         :param state: N states
         :return: actions of shape (N, A), and their log-density of shape (N,)
         """
-        return self._distribution().log_prob_from_params(*self._parameters(state))
+        return self._distribution().log_prob_from_params(*self._mean_log_std(state))
 
     def _distribution(self) -> SquashedDiagGaussianDistribution:
         return SquashedDiagGaussianDistribution(self.action_dim)
 
-    def _parameters(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
-        mean, spread = self.parameters_net(self.readout(state.grid)).float().chunk(2, dim=1)
+    def _mean_log_std(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+        mean, spread = self.mean_log_std_net(self.readout(state.grid)).float().chunk(2, dim=1)
         # Smooth bounds keep a gradient where a clamp would have none
         return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (th.tanh(spread) + 1)

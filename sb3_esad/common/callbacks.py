@@ -9,7 +9,6 @@ from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, Ev
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
-from sb3_esad.common.costs import CostReader
 from sb3_esad.common.evaluation import evaluate_policy
 
 
@@ -29,18 +28,17 @@ class LagrangeCallback(BaseCallback):
     """
     Shows the penalty the costs of every step and lets it move its multiplier once per collected rollout.
 
-    The model has a ``penalty``, a ``cost_key`` and a ``take_violation()`` that returns the mean of Gamma - d since its last
+    The model has a ``penalty``, a ``replay_buffer`` that reads costs and a ``take_violation()`` that returns the mean of Gamma - d since its last
     call, or None if there was no update. Everything that must be remembered is in the penalty, which is saved with the model.
     """
 
     model: Any
 
     def _init_callback(self) -> None:
-        self._read_costs = CostReader(self.model.cost_key)
         self._n_updates_seen = self.model._n_updates
 
     def _on_step(self) -> bool:
-        self.model.penalty.observe(self._read_costs(self.locals["infos"]), self.locals["dones"])
+        self.model.penalty.observe(self.model.replay_buffer.read_costs(self.locals["infos"]), self.locals["dones"])
         return True
 
     def _on_rollout_end(self) -> None:

@@ -67,6 +67,18 @@ class QEnsemble(nn.Module):
         self.q_networks = nn.ModuleList(
             mlp(self.features.features_dim, net_arch, self.distribution.n_bins, zero_output=True) for _ in range(n_critics)
         )
+        self.register_buffer("scale", th.tensor(1.0))
+
+    @th.no_grad()
+    def follow_scale(self, returns: th.Tensor, rate: float = 0.01) -> None:
+        """
+        Keep track of how much returns differ, so that the actor sees them at a common scale (DreamerV3, Eq. 7).
+
+        :param returns: any shape
+        :param rate: share of the new value in the moving average
+        """
+        low, high = th.quantile(returns.float(), th.tensor([0.05, 0.95], device=returns.device))
+        self.scale.add_(rate * ((high - low) - self.scale)).clamp_(min=1.0)
 
     def logits(self, state: LatentState) -> th.Tensor:
         """

@@ -35,7 +35,7 @@ class ImageHead(nn.Module):
         self.foreground_weight = foreground_weight
         self.cells = (math.ceil(image_shape[1] / 8), math.ceil(image_shape[2] / 8))
         self.layers = nn.Sequential(
-            conv_block(grid_shape[0], 4 * channels, 3), nn.PixelShuffle(2), conv_block(channels, channels, 3)
+            conv_block(grid_shape[0], 4 * channels, 1), nn.PixelShuffle(2), conv_block(channels, channels, 3)
         )
         self.pixels = nn.Linear(channels, 16 * image_shape[0])
         self.register_buffer("background", th.zeros(2 * self.cells[0], 2 * self.cells[1], 16 * image_shape[0]))

@@ -21,6 +21,7 @@ class EpisodeRecord(nn.Module):
     costs: th.Tensor
     discounted_costs: th.Tensor
     n_episodes: th.Tensor
+    n_cost_free: th.Tensor
     mean_length: th.Tensor
     prediction_sum: th.Tensor
     prediction_weight: th.Tensor
@@ -34,6 +35,7 @@ class EpisodeRecord(nn.Module):
         self.register_buffer("costs", th.zeros(window))
         self.register_buffer("discounted_costs", th.zeros(window))
         self.register_buffer("n_episodes", th.zeros(()))
+        self.register_buffer("n_cost_free", th.zeros(()))
         self.register_buffer("mean_length", th.tensor(float(episode_length)))
         self.register_buffer("prediction_sum", th.zeros(()))
         self.register_buffer("prediction_weight", th.zeros(()))
@@ -64,7 +66,8 @@ class EpisodeRecord(nn.Module):
         self.discounted_costs[slot] = episode.discounted_cost
         self.n_episodes += 1
         if episode.cost == 0:
-            self.mean_length += (episode.length - self.mean_length) / self.window
+            self.n_cost_free += 1
+            self.mean_length += (episode.length - self.mean_length) / self.n_cost_free.clamp(max=self.window)
 
     @th.no_grad()
     def note_prediction(self, values: th.Tensor) -> None:

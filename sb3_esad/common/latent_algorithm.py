@@ -18,7 +18,8 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
-from sb3_esad.common.costs import CostReader, EpisodeCosts
+from sb3_esad.common.costs import EpisodeCosts
+from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
@@ -152,9 +153,9 @@ class LatentAlgorithm(OffPolicyAlgorithm):
             "cost_key": self.cost_key,
         }
         super()._setup_model()
+        keep_freed_memory()
         self._last_latent: LatentState | None = None
         self._random_actions: np.ndarray | None = None
-        self._read_costs = CostReader(self.cost_key)
         self._episode_costs = EpisodeCosts()
 
     # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
@@ -195,7 +196,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
         assert dones is not None
-        costs = self._read_costs(infos)
+        costs = self.replay_buffer.read_costs(infos)
         self.total_cost += float(costs.sum())
         for episode in self._episode_costs.add(costs, dones):
             infos[episode.env].get("episode", {})["c"] = episode.cost
@@ -331,7 +332,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         return ["policy", *self._optimizers()], []
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_read_costs", "_episode_costs"]
+        return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]
 
 
 def _draw(weights: th.Tensor, n: int) -> th.Tensor:

@@ -29,7 +29,7 @@ class Gaussian(NamedTuple):
 
         :return: shape of ``mean``
         """
-        return self.mean + self.std * th.randn_like(self.mean)
+        return self.mean + self.std * th.randn(self.mean.shape, device=self.mean.device)
 
     def detach(self) -> "Gaussian":
         """
@@ -132,7 +132,7 @@ class GaussianHead(LatentHead):
         kernel = kernel_size(memory_shape)
         self.scales = (dynamics_scale, representation_scale)
         self.free_nats = free_nats
-        self.embedding_net = same_conv(embedding_channels, hidden_channels, kernel)
+        self.embedding_net = same_conv(embedding_channels, hidden_channels, 1)
         self.memory_net = same_conv(memory_shape[0], hidden_channels, kernel)
         self.prior_net = nn.Sequential(
             conv_block(memory_shape[0], hidden_channels, kernel), same_conv(hidden_channels, 2 * latent_channels, 1)

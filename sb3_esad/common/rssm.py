@@ -164,15 +164,16 @@ class RSSM(nn.Module):
         firsts = [LatentState(*fields) for fields in zip(*(field.split(resets) for field in first), strict=True)]
         befores, states, posteriors, priors = [], [], [], []
         state = firsts[0]
-        for t in range(len(actions)):
+        for t, (action, embedding) in enumerate(zip(actions.unbind(), embeddings.unbind(), strict=True)):
             if t > 0 and resets[t] > 0:
                 state = _replace(state, is_first[t], firsts[t])
-            state = state._replace(action=actions[t])
+            state = state._replace(action=action)
             befores.append(state)
             memory = self.advance(state)
-            prior, posterior = self.head.prior(memory), self.head.posterior(memory, embeddings[t])
-            latent = th.where(hidden[t, :, None, None, None], prior.sample(), posterior.sample())
-            state = LatentState(memory, latent, th.zeros_like(state.action))
+            prior, posterior = self.head.prior(memory), self.head.posterior(memory, embedding)
+            blind = hidden[t, :, None, None, None]
+            latent = Gaussian(*(th.where(blind, p, q) for p, q in zip(prior, posterior, strict=True))).sample()
+            state = LatentState(memory, latent, th.zeros_like(action))
             states.append(state), posteriors.append(posterior), priors.append(prior)
         return Filtered(_stack(states), _stack(befores), _stack(posteriors), _stack(priors), is_first, hidden)
 

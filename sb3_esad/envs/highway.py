@@ -90,6 +90,7 @@ class Highway(Scenario):
             "merge_start": (150.0, 330.0),
             "merge_length": 180.0,
             "slowdown_share": 0.25,
+            "slowdown_start": (2.0, 15.0),
             "slowdown_speed": 12.0,
             "slowdown_duration": 3.0,
         }
@@ -168,24 +169,21 @@ class Highway(Scenario):
 
     def _draw_slowdown(self) -> None:
         happens = self.np_random.random() < self.config["slowdown_share"]
-        self._slowdown_start = float(self.np_random.uniform(2.0, 15.0)) if happens else np.inf
+        self._slowdown_start = float(self.np_random.uniform(*self.config["slowdown_start"])) if happens else np.inf
         self._slowed: tuple[int, float] | None = None
 
     def _before_physics(self) -> None:
         """Now and then the car ahead slows down sharply for some seconds, then drives on."""
-        traffic, time = self.traffic, self.episode.time
-        if self._slowed is not None:
-            if time > self._slowdown_start + self.config["slowdown_duration"]:
-                row, speed = self._slowed
-                traffic.target_speed[row] = speed
-                self._slowed, self._slowdown_start = None, np.inf
-        elif time >= self._slowdown_start:
-            front = int(traffic.neighbours(np.array([EGO]), traffic.lane[:1])[0][0])
-            if front in traffic.drivers:
-                self._slowed = (front, float(traffic.target_speed[front]))
-                traffic.target_speed[front] = self.config["slowdown_speed"]
-            else:
-                self._slowdown_start = np.inf
+        traffic, waited = self.traffic, self.episode.time - self._slowdown_start
+        front = int(traffic.front[EGO])
+        if self._slowed is None and waited >= 0 and front in traffic.drivers:
+            self._slowed = (front, float(traffic.target_speed[front]))
+            self._slowdown_start = self.episode.time
+            traffic.target_speed[front] = self.config["slowdown_speed"]
+        elif self._slowed is not None and waited >= self.config["slowdown_duration"]:
+            row, speed = self._slowed
+            traffic.target_speed[row] = speed
+            self._slowed, self._slowdown_start = None, np.inf
 
     def _progress(self) -> float:
         return float(self.traffic.position[EGO, 0])

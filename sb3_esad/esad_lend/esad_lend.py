@@ -1,0 +1,272 @@
+"""ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
+
+from typing import Any, ClassVar
+
+import numpy as np
+import torch as th
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.utils import polyak_update
+
+from sb3_esad.common.callbacks import LagrangeCallback, prepend
+from sb3_esad.common.entropy import make_entropy_coefficient
+from sb3_esad.common.functional import barrier_residual, capped_cvar
+from sb3_esad.common.latent_algorithm import LatentAlgorithm
+from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty, Penalty
+from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
+from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
+from sb3_esad.esad_lend.targets import (
+    Transitions,
+    cost_targets,
+    imagined_transitions,
+    recorded_cost_targets,
+    recorded_return_targets,
+    recorded_transitions,
+    return_targets,
+)
+
+UNKNOWN_LENGTH = 1000
+
+
+class ESADLEND(LatentAlgorithm):
+    """
+    Enhanced Safety in Autonomous Driving: Latent State Diffusion Model for End-to-End Navigation (arXiv 2407.06317).
+
+    A soft actor-critic learns in the imagination of a world model. Cost critics predict mean and variance of the cost to
+    come; an augmented Lagrangian keeps their conditional value at risk within a budget.
+
+    :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
+    :param env: environment with a Box action space, whose info dict holds a cost in [0, 1]
+    :param cost_limit: undiscounted cost allowed per episode; 0 is strict, None is no limit
+    :param risk_level: worst fraction of outcomes that shall keep the limit, in (0, 1]; 1 limits the mean
+    :param cost_gamma: discount of the cost; None for ``gamma``
+    :param ent_coef: weight of the entropy; a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to learn it from 0.1
+    :param target_entropy: entropy that a learned weight maintains, in nats; ``"auto"`` for minus the size of the action
+    :param lagrangian_multiplier_init: initial multiplier
+    :param lambda_lr: step of the multiplier per update
+    :param lagrangian_upper_bound: largest multiplier
+    :param penalty_coef: proportional gain of the augmented Lagrangian; 0 is the plain Lagrangian
+    :param penalty_warmup: updates during which the multiplier is held
+    :param barrier_decay: alpha_b in (0, 1], how fast the risk must return to the budget; larger is less conservative
+    :param barrier_steps: m, steps over which the barrier condition is taken
+    :param barrier_coef: weight of a violated barrier condition; 0 drops it
+    :param replay_critic_coef: weight of recorded transitions in the loss of the reward critics
+    :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics
+    :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
+    :param kwargs: see :class:`LatentAlgorithm`
+    :raises ValueError: if an argument is out of its range
+    """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
+    penalty_class: ClassVar[type[Penalty]] = AugmentedLagrangian
+
+    def __init__(
+        self,
+        policy: str | type[LatentPolicy],
+        env: GymEnv | str,
+        cost_limit: float | None = 0.05,
+        risk_level: float = 0.5,
+        cost_gamma: float | None = None,
+        ent_coef: str | float = "auto_0.1",
+        target_entropy: str | float = "auto",
+        lagrangian_multiplier_init: float = 1.0,
+        lambda_lr: float = 0.01,
+        lagrangian_upper_bound: float = 50.0,
+        penalty_coef: float = 1.0,
+        penalty_warmup: int = 1000,
+        barrier_decay: float = 0.3,
+        barrier_steps: int = 2,
+        barrier_coef: float = 0.0,
+        replay_critic_coef: float = 0.3,
+        replay_cost_critic_coef: float = 1.0,
+        uniform_action_prob: float = 0.3,
+        _init_setup_model: bool = True,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(policy, env, _init_setup_model=False, **kwargs)
+        self.cost_limit = cost_limit
+        self.risk_level = risk_level
+        self.cost_gamma = cost_gamma
+        self.ent_coef = ent_coef
+        self.target_entropy = target_entropy
+        self.lagrangian_multiplier_init = lagrangian_multiplier_init
+        self.lambda_lr = lambda_lr
+        self.lagrangian_upper_bound = lagrangian_upper_bound
+        self.penalty_coef = penalty_coef
+        self.penalty_warmup = penalty_warmup
+        self.barrier_decay = barrier_decay
+        self.barrier_steps = barrier_steps
+        self.barrier_coef = barrier_coef
+        self.replay_critic_coef = replay_critic_coef
+        self.replay_cost_critic_coef = replay_cost_critic_coef
+        self.uniform_action_prob = uniform_action_prob
+        if _init_setup_model:
+            self._setup_model()
+
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.penalty = self._make_penalty().to(self.device)
+        target = -float(self.policy.actor.action_dim) if self.target_entropy == "auto" else float(self.target_entropy)
+        self.entropy = make_entropy_coefficient(self.ent_coef, target, self.lr_schedule(1)).to(self.device)
+        self._violations: list[th.Tensor] = []
+
+    def _make_penalty(self) -> Penalty:
+        penalty_class = NoPenalty if self.cost_limit is None else self.penalty_class
+        return penalty_class(
+            cost_limit=self.cost_limit,
+            risk_level=self.risk_level,
+            cost_gamma=self._cost_gamma,
+            episode_length=self._episode_length(),
+            barrier_coef=self.barrier_coef,
+            lambda_lr=self.lambda_lr,
+            multiplier_init=self.lagrangian_multiplier_init,
+            multiplier_bounds=(min(0.05, self.lagrangian_multiplier_init), self.lagrangian_upper_bound),
+            penalty_coef=self.penalty_coef,
+            penalty_warmup=self.penalty_warmup,
+        )
+
+    def _episode_length(self) -> float:
+        """Longest episode the environment admits, until episodes have been seen."""
+        specs = self.env.get_attr("spec") if self.env is not None else []
+        return float(next((spec.max_episode_steps for spec in specs if spec and spec.max_episode_steps), UNKNOWN_LENGTH))
+
+    @property
+    def _cost_gamma(self) -> float:
+        return self.gamma if self.cost_gamma is None else self.cost_gamma
+
+    def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
+        return super()._init_callback(prepend(LagrangeCallback(), callback), progress_bar)
+
+    def take_violation(self) -> th.Tensor | None:
+        """
+        Hand over how far the expected risk exceeded the budget since the last call.
+
+        :return: mean of Gamma - d over replayed states, None if there was no update since
+        """
+        violations, self._violations = self._violations, []
+        return th.stack(violations).mean() if violations else None
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        starts = self._last_episode_starts
+        sampled = super()._sample_action(learning_starts, action_noise, n_envs)
+        if self._n_updates > 0 and starts is not None and starts.any():
+            self._note_prediction(starts)
+        return sampled
+
+    @th.no_grad()
+    def _note_prediction(self, starts: np.ndarray) -> None:
+        """Tell the penalty what the critics expect of the episodes that start now."""
+        assert self._last_latent is not None
+        begun = th.as_tensor(starts, device=self.device)
+        means, _ = self.policy.cost_critic(self._last_latent.map(lambda field: field[begun]))
+        self.penalty.note_prediction(means.mean(0))
+
+    def _first_actions(self, start: LatentState) -> th.Tensor:
+        # The critics must know what actions lead to that the policy would never take
+        actions = super()._first_actions(start)
+        explore = th.rand(len(actions), 1, device=actions.device) < self.uniform_action_prob
+        return th.where(explore, 2 * th.rand_like(actions) - 1, actions)
+
+    def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
+        recorded = recorded_transitions(self.policy, samples, filtered)
+        logs = {
+            **self._update_critic(imagined, recorded),
+            **self._update_cost_critic(imagined, recorded),
+            **self._update_actor(imagined),
+        }
+        for name in ("critic", "cost_critic"):
+            target = getattr(self.policy, f"{name}_target")
+            polyak_update(getattr(self.policy, name).parameters(), target.parameters(), self.tau)
+        return logs
+
+    def _update_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
+        targets = return_targets(self.policy, imagined, self.gamma, self.lambda_return)
+        recorded_targets = recorded_return_targets(self.policy, recorded, self.gamma)
+        critic = self.policy.critic
+        critic.follow_scale(targets)
+        dreamed = (imagined.weights.flatten() * critic.loss(imagined_transitions(imagined), targets.flatten())).mean()
+        anchored = (recorded.event_weights * critic.loss(recorded.states, recorded_targets)).mean()
+        self._step(critic, dreamed + self.replay_critic_coef * anchored)
+        return {
+            "critic_loss": dreamed.item(),
+            "replay_critic_loss": anchored.item(),
+            "imagined_return": targets[0].mean().item(),
+            "imagined_reward": imagined.predictions.rewards.mean().item(),
+        }
+
+    def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
+        continue_after_cost = self.replay_buffer.continue_after_cost
+        critic = self.policy.cost_critic
+        if continue_after_cost > 0:
+            for each in (critic, self.policy.cost_critic_target):
+                each.raise_bound(1 / (1 - self._cost_gamma))
+        targets = cost_targets(self.policy, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
+        anchors = recorded_cost_targets(self.policy, recorded, self._cost_gamma)
+        weights = imagined.weights.flatten()
+        mean_loss, variance_loss = critic.loss(imagined_transitions(imagined), *(each.flatten() for each in targets))
+        anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.states, *anchors)
+        dreamed = (weights * (mean_loss + variance_loss)).mean()
+        anchored = (recorded.event_weights * (anchor_mean_loss + anchor_variance_loss)).mean()
+        self._step(critic, dreamed + self.replay_cost_critic_coef * anchored)
+        return {
+            "cost_critic_loss": (weights * mean_loss).mean().item(),
+            "cost_var_loss": (weights * variance_loss).mean().item(),
+            "replay_cost_critic_loss": anchor_mean_loss.mean().item(),
+            "imagined_cost": targets.means[0].mean().item(),
+        }
+
+    def _update_actor(self, imagined: Imagination) -> Logs:
+        states = imagined_transitions(imagined)
+        actions, log_prob = self.policy.actor.action_log_prob(states)
+        chosen = states._replace(action=actions)
+        value = self.policy.critic(chosen).min(0).values
+        risk = self.risk(chosen)
+        barrier = self._barrier(risk.detach().view_as(imagined.weights))
+        objective = self.entropy() * log_prob - value / self.policy.critic.scale
+        loss = (imagined.weights.flatten() * self.penalty.combine(objective, risk, barrier.flatten())).mean()
+        self._step(self.policy.actor, loss)
+        usual_risk = risk.detach()[: self.imagination_starts // 2].mean()
+        self._violations.append(usual_risk - self.penalty.budget)
+        return {
+            "actor_loss": loss.item(),
+            "cvar": usual_risk.item(),
+            "barrier_residual": barrier.relu().mean().item(),
+            "entropy": -log_prob.mean().item(),
+            "return_scale": self.policy.critic.scale.item(),
+            **self.entropy.update(log_prob),
+        }
+
+    def risk(self, states: LatentState) -> th.Tensor:
+        """
+        Safety measure Gamma: conditional value at risk of the cost to come, by the more pessimistic critic.
+
+        :param states: N states and their actions
+        :return: shape (N,)
+        """
+        means, variance = self.policy.cost_critic(states)
+        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic.bound).max(0).values
+
+    def _barrier(self, risk: th.Tensor) -> th.Tensor:
+        """Residual at each imagined step, of shape (H, N); the last m steps look too far ahead and count as safe."""
+        residual = th.zeros_like(risk)
+        steps = self.barrier_steps
+        residual[:-steps] = barrier_residual(risk[steps:], risk[:-steps], self.penalty.budget, self.barrier_decay)
+        return residual
+
+    def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
+        names, variables = super()._get_torch_save_params()
+        optimizers = (f"entropy.{name}" for name in self.entropy.optimizer_names)
+        return [*names, "penalty", "entropy", *optimizers], variables
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "penalty", "entropy", "_violations"]
