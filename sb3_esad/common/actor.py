@@ -5,7 +5,6 @@ from stable_baselines3.common.distributions import SquashedDiagGaussianDistribut
 from torch import nn
 
 from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
-from sb3_esad.common.type_aliases import LatentState
 
 LOG_STD_MIN, LOG_STD_MAX = -3.0, 1.0
 
@@ -27,29 +26,29 @@ class Actor(nn.Module):
         self.readout = GridReadout(grid_shape, net_arch[0])
         self.mean_log_std_net = mlp(net_arch[0], net_arch[1:], 2 * action_dim, zero_output=True)
 
-    def forward(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
+    def forward(self, grid: th.Tensor, deterministic: bool = False) -> th.Tensor:
         """
         Choose actions.
 
-        :param state: N states
+        :param grid: features of N states, of shape (N, C, H, W)
         :param deterministic: take the mode instead of a sample
         :return: shape (N, A)
         """
-        return self._distribution().actions_from_params(*self._mean_log_std(state), deterministic=deterministic)
+        return self._distribution().actions_from_params(*self._mean_log_std(grid), deterministic=deterministic)
 
-    def action_log_prob(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+    def action_log_prob(self, grid: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Draw reparameterised actions.
 
-        :param state: N states
+        :param grid: features of N states, of shape (N, C, H, W)
         :return: actions of shape (N, A), and their log-density of shape (N,)
         """
-        return self._distribution().log_prob_from_params(*self._mean_log_std(state))
+        return self._distribution().log_prob_from_params(*self._mean_log_std(grid))
 
     def _distribution(self) -> SquashedDiagGaussianDistribution:
         return SquashedDiagGaussianDistribution(self.action_dim)
 
-    def _mean_log_std(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
-        mean, spread = self.mean_log_std_net(self.readout(state.grid)).float().chunk(2, dim=1)
+    def _mean_log_std(self, grid: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        mean, spread = self.mean_log_std_net(self.readout(grid)).float().chunk(2, dim=1)
         # Smooth bounds keep a gradient where a clamp would have none
         return mean, LOG_STD_MIN + 0.5 * (LOG_STD_MAX - LOG_STD_MIN) * (th.tanh(spread) + 1)

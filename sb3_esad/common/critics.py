@@ -8,7 +8,6 @@ from torch import nn
 
 from sb3_esad.common.heads import ValueDistribution
 from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
-from sb3_esad.common.type_aliases import LatentState
 
 MIN_VARIANCE = 1e-4
 Module = TypeVar("Module", bound=nn.Module)
@@ -38,14 +37,15 @@ class StateActionFeatures(nn.Module):
         self.readout = GridReadout(grid_shape, units)
         self.features_dim = units + action_dim
 
-    def forward(self, state: LatentState) -> th.Tensor:
+    def forward(self, grid: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
         Summarise.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :return: shape (N, features_dim)
         """
-        return th.cat([self.readout(state.grid), state.action], dim=1)
+        return th.cat([self.readout(grid), action], dim=1)
 
 
 class QEnsemble(nn.Module):
@@ -80,34 +80,37 @@ class QEnsemble(nn.Module):
         low, high = th.quantile(returns.float(), th.tensor([0.05, 0.95], device=returns.device))
         self.scale.add_(rate * ((high - low) - self.scale)).clamp_(min=1.0)
 
-    def logits(self, state: LatentState) -> th.Tensor:
+    def logits(self, grid: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
         Distributions of the return.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :return: shape (n_critics, N, n_bins)
         """
-        features = self.features(state)
+        features = self.features(grid, action)
         return th.stack([q_network(features) for q_network in self.q_networks])
 
-    def forward(self, state: LatentState) -> th.Tensor:
+    def forward(self, grid: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
         Expected return.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :return: one estimate of each critic, of shape (n_critics, N)
         """
-        return self.distribution.mean(self.logits(state))
+        return self.distribution.mean(self.logits(grid, action))
 
-    def loss(self, state: LatentState, targets: th.Tensor) -> th.Tensor:
+    def loss(self, grid: th.Tensor, action: th.Tensor, targets: th.Tensor) -> th.Tensor:
         """
         Cross-entropy of each critic with the targets, summed over critics.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :param targets: returns, of shape (N,)
         :return: shape (N,)
         """
-        return self.distribution.loss(self.logits(state), targets.expand(len(self.q_networks), -1)).sum(0)
+        return self.distribution.loss(self.logits(grid, action), targets.expand(len(self.q_networks), -1)).sum(0)
 
 
 class CostCritic(nn.Module):
@@ -144,40 +147,45 @@ class CostCritic(nn.Module):
                 network[-1].bias -= th.log(bound / self.bound)  # so that small estimates stay what they are
             self.bound.fill_(bound)
 
-    def forward(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+    def forward(self, grid: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         Mean and variance of the discounted cost.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :return: means of shape (n_critics, N), variance of shape (N,)
         """
-        logits, variance = self.raw(state)
+        logits, variance = self.raw(grid, action)
         return self.bound * logits.sigmoid(), variance
 
-    def raw(self, state: LatentState) -> tuple[th.Tensor, th.Tensor]:
+    def raw(self, grid: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """
         What the losses are taken on: logits of mean / bound, and the variance.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :return: logits of shape (n_critics, N), variance of shape (N,)
         """
-        features = self.features(state)
+        features = self.features(grid, action)
         logits = th.stack([network(features).float().squeeze(-1) for network in self.means])
         variance = nn.functional.softplus(self.variance(features).float().squeeze(-1)) + MIN_VARIANCE
         return logits, variance
 
-    def loss(self, state: LatentState, mean_targets: th.Tensor, variance_targets: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+    def loss(
+        self, grid: th.Tensor, action: th.Tensor, mean_targets: th.Tensor, variance_targets: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
         """
         Cross-entropy of the means and squared error of the variance.
 
         Not the 2-Wasserstein distance of arXiv 2407.06317: on sampled targets it converges to a fraction of the true deviation.
 
-        :param state: N states and their actions
+        :param grid: features of N states, of shape (N, C, H, W)
+        :param action: their actions, of shape (N, A)
         :param mean_targets: discounted costs, of shape (N,)
         :param variance_targets: their variance, of shape (N,)
         :return: loss of the means summed over critics, and of the variance, each of shape (N,)
         """
-        logits, variance = self.raw(state)
+        logits, variance = self.raw(grid, action)
         fractions = (mean_targets / self.bound).clamp(0, 1).expand_as(logits)
         mean_loss = nn.functional.binary_cross_entropy_with_logits(logits, fractions, reduction="none").sum(0)
         return mean_loss, (variance - variance_targets).square()

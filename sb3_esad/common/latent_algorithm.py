@@ -23,6 +23,7 @@ from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.save_util import check_saved_model, whole_file
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
 
 SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
@@ -305,7 +306,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
         with th.no_grad():
-            return self.policy.actor(start)
+            return self.policy.actor(self.policy.world_model.features(start))
 
     def _choose_starts(self, samples: SequenceSamples, filtered: Filtered) -> LatentState:
         """Half the starts come from uniformly drawn windows, half from shortly before a cost; the former stand first."""
@@ -323,6 +324,38 @@ class LatentAlgorithm(OffPolicyAlgorithm):
             self.logger.record(f"train/{name}", float(np.mean(values)))
 
     # Saving
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save the model to a zip that is there as a whole or not at all.
+
+        :param path: where to; ``.zip`` is added to a path without a suffix
+        :param exclude: attributes to leave out beside the usual ones
+        :param include: attributes to save although they are usually left out
+        """
+        with whole_file(path, ".zip") as target:
+            super().save(target, exclude, include)
+
+    @classmethod
+    def load(
+        cls: type[SelfLatentAlgorithm], path: str | pathlib.Path | io.BufferedIOBase, *args: Any, **kwargs: Any
+    ) -> SelfLatentAlgorithm:
+        """
+        Load a saved model.
+
+        :param path: its zip; ``.zip`` may be left out
+        :param args: see SB3's ``BaseAlgorithm.load``
+        :param kwargs: likewise
+        :return: the model
+        :raises ValueError: if the file is missing, damaged or holds something else
+        """
+        check_saved_model(path, cls.__name__, mark="imagination_horizon")
+        return super().load(path, *args, **kwargs)
 
     def _optimizers(self) -> dict[str, th.optim.Optimizer]:
         names = ("world_model", "actor", "critic", "cost_critic")

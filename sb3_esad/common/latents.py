@@ -29,7 +29,9 @@ class Gaussian(NamedTuple):
 
         :return: shape of ``mean``
         """
-        return self.mean + self.std * th.randn(self.mean.shape, device=self.mean.device)
+        # Noise with the channels last in memory, as everything else on the grid
+        noise = th.randn(self.mean.movedim(-3, -1).shape, device=self.mean.device).movedim(-1, -3)
+        return self.mean + self.std * noise
 
     def detach(self) -> "Gaussian":
         """
@@ -152,7 +154,7 @@ class GaussianHead(LatentHead):
 
     def sample(self, memory: th.Tensor, embedding: th.Tensor | None = None, n_candidates: int = 1) -> th.Tensor:
         gaussian = self.prior(memory) if embedding is None else self.posterior(memory, embedding)
-        return Gaussian(*(parameter.repeat(n_candidates, 1, 1, 1) for parameter in gaussian)).sample()
+        return Gaussian(*(th.cat([parameter] * n_candidates) for parameter in gaussian)).sample()
 
     def loss(self, posterior: Gaussian, prior: Gaussian) -> tuple[th.Tensor, Logs]:
         dynamics = kl_divergence(posterior.detach(), prior)

@@ -135,7 +135,7 @@ class LatentPolicy(BasePolicy):
         :return: actions scaled to [-1, 1], of shape (N, A)
         """
         with autocast(self.device):
-            return self.actor(state, deterministic)
+            return self.actor(self.world_model.features(state), deterministic)
 
     def predict(
         self,

@@ -29,3 +29,13 @@ def autocast(device: th.device) -> AbstractContextManager[None]:
     if has_fast_bfloat16(device):
         return th.autocast(device.type, dtype=th.bfloat16)
     return contextlib.nullcontext()
+
+
+def working_dtype(device: th.device) -> th.dtype:
+    """
+    Tell what convolutions compute in, so that their inputs are converted once and not by each of them.
+
+    :param device: where the networks live
+    :return: the type of :func:`autocast` inside of it, float32 elsewhere
+    """
+    return th.get_autocast_dtype(device.type) if th.is_autocast_enabled(device.type) else th.float32

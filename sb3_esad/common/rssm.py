@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.latents import Gaussian, LatentHead
-from sb3_esad.common.torch_layers import ChannelNorm, GridShape, kernel_size, same_conv
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, join, kernel_size, same_conv
 from sb3_esad.common.type_aliases import LatentState
 
 
@@ -179,7 +179,7 @@ class RSSM(nn.Module):
 
 
 def _stack(items):  # type: ignore[no-untyped-def]
-    return type(items[0])(*(th.stack(fields) for fields in zip(*items, strict=True)))
+    return type(items[0])(*(join(fields) for fields in zip(*items, strict=True)))
 
 
 def _replace(state: LatentState, mask: th.Tensor, values: LatentState) -> LatentState:

@@ -92,7 +92,7 @@ class GridReadout(nn.Module):
         channels, height, width = shape
         cell_features = max(1, min(channels, flat_features // (height * width)))
         self.features_dim = features_dim
-        self.cells = conv_block(channels, cell_features, 1)
+        self.cells = nn.Sequential(same_conv(channels, cell_features, 1), nn.SiLU())
         self.mix = nn.Sequential(
             nn.Flatten(), nn.Linear(cell_features * height * width, features_dim), nn.LayerNorm(features_dim), nn.SiLU()
         )
@@ -105,3 +105,13 @@ class GridReadout(nn.Module):
         :return: summaries, of shape (N, features_dim)
         """
         return self.mix(self.cells(grid))
+
+
+def join(tensors: Sequence[th.Tensor]) -> th.Tensor:
+    """
+    Stack along a new first dimension, keeping channels last in memory, which ``th.stack`` would not.
+
+    :param tensors: of shape (N, ...)
+    :return: shape (len(tensors), N, ...)
+    """
+    return th.cat(list(tensors)).unflatten(0, (len(tensors), -1))

@@ -89,11 +89,13 @@ class Imagination(NamedTuple):
     """
     Trajectories in the latent space under the policy; N starts, H steps.
 
-    :param states: the starts and the states reached, fields of shape (H + 1, N, ...); the last action is not executed
+    :param grids: features of the starts and of the states reached, of shape (H + 1, N, C, height, width)
+    :param actions: chosen in these states, the last of them not executed, of shape (H + 1, N, A)
     :param predictions: of the states reached, fields of shape (H, N)
     :param weights: discounted probability that the state is reached at all, of shape (H, N)
     """
 
-    states: LatentState
+    grids: th.Tensor
+    actions: th.Tensor
     predictions: Predictions
     weights: th.Tensor

@@ -12,7 +12,9 @@ from torch import nn
 from sb3_esad.common.extractors import grid_shape
 from sb3_esad.common.decoders import ImageHead, VectorHead
 from sb3_esad.common.heads import PredictionHeads
+from sb3_esad.common.precision import working_dtype
 from sb3_esad.common.rssm import RSSM, Filtered
+from sb3_esad.common.torch_layers import join
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, Predictions, SequenceSamples
 
 Observations = th.Tensor | TensorDict
@@ -110,36 +112,45 @@ class WorldModel(nn.Module):
 
     @th.no_grad()
     def imagine(
-        self, start: LatentState, policy: Callable[[LatentState], th.Tensor], horizon: int, gamma: float
+        self, start: LatentState, policy: Callable[[th.Tensor], th.Tensor], horizon: int, gamma: float
     ) -> Imagination:
         """
         Roll the policy out in the latent space.
 
         :param start: N states and the first actions to take
-        :param policy: draws the actions that follow, of shape (N, A)
+        :param policy: draws the actions that follow, of shape (N, A), for features of states
         :param horizon: number of steps
         :param gamma: discount in the weights
         :return: the trajectories
         """
-        state, states = start, [start]
+        grids, actions, state = [self.features(start)], [start.action], start
         for _ in range(horizon):
             state = self.rssm.imagine(state)
-            state = state._replace(action=policy(state))
-            states.append(state)
-        trajectory = LatentState(*(th.stack(fields) for fields in zip(*states, strict=True)))
-        predictions = self.predict(trajectory.map(lambda field: field[1:]))
+            grids.append(self.features(state))
+            state = state._replace(action=policy(grids[-1]))
+            actions.append(state.action)
+        trajectory = join(grids)
+        predictions = self.predict(trajectory[1:])
         alive = th.cat([th.ones_like(predictions.continues[:1]), gamma * predictions.continues[:-1]])
-        return Imagination(trajectory, predictions, alive.cumprod(0))
+        return Imagination(trajectory, join(actions), predictions, alive.cumprod(0))
 
-    def predict(self, states: LatentState) -> Predictions:
+    def features(self, state: LatentState) -> th.Tensor:
+        """
+        Give what actor and critics see of a state.
+
+        :param state: N states
+        :return: memory and latent side by side, of shape (N, C, H, W)
+        """
+        return state.grid.to(working_dtype(state.memory.device)).contiguous(memory_format=th.channels_last)
+
+    def predict(self, grids: th.Tensor) -> Predictions:
         """
         Predict reward, cost and continuation.
 
-        :param states: states reached, fields of shape (T, N, ...)
+        :param grids: features of the states reached, of shape (T, N, C, H, W)
         :return: fields of shape (T, N)
         """
-        steps, n = states.memory.shape[:2]
-        return Predictions(*(field.view(steps, n) for field in self.predictions(states.grid.flatten(0, 1))))
+        return Predictions(*(field.unflatten(0, grids.shape[:2]) for field in self.predictions(grids.flatten(0, 1))))
 
     def reconstruct(self, states: LatentState) -> dict[str, th.Tensor]:
         """
@@ -148,7 +159,7 @@ class WorldModel(nn.Module):
         :param states: N states
         :return: preprocessed observations by key, of shape (N, ...); the key of a single observation is "observation"
         """
-        return {key: head(states.grid) for key, head in self.observations.items()}
+        return {key: head(self.features(states)) for key, head in self.observations.items()}
 
     def loss(self, samples: SequenceSamples) -> tuple[th.Tensor, Filtered, Logs]:
         """
@@ -159,7 +170,7 @@ class WorldModel(nn.Module):
         """
         steps = samples.rewards.T
         filtered = self.observe(samples, self._withhold(steps))
-        grid = filtered.states.grid.flatten(0, 1)
+        grid = self.features(filtered.states.map(lambda field: field.flatten(0, 1)))
         targets = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
         weights = samples.event_weights.expand_as(steps).flatten()
         prediction_loss, logs = self.predictions.loss(grid, targets, weights)
@@ -182,9 +193,8 @@ class WorldModel(nn.Module):
 
     def _preprocess(self, observations: Observations) -> Observations:
         # Images are as exact in bfloat16 as they were as bytes, and half as large
-        dtype = th.get_autocast_dtype("cpu") if th.is_autocast_enabled("cpu") else th.float32
         preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
-        return _map(preprocessed, lambda x: x.to(dtype) if x.dim() == 4 else x)
+        return _map(preprocessed, lambda x: x.to(working_dtype(x.device)) if x.dim() == 4 else x)
 
 
 def _by_key(value):  # type: ignore[no-untyped-def]

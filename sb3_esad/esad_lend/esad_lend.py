@@ -22,11 +22,11 @@ from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
     Transitions,
     cost_targets,
-    imagined_transitions,
     recorded_cost_targets,
     recorded_return_targets,
     recorded_transitions,
     return_targets,
+    taken,
 )
 
 UNKNOWN_LENGTH = 1000
@@ -168,7 +168,8 @@ class ESADLEND(LatentAlgorithm):
         """Tell the penalty what the critics expect of the episodes that start now."""
         assert self._last_latent is not None
         begun = th.as_tensor(starts, device=self.device)
-        means, _ = self.policy.cost_critic(self._last_latent.map(lambda field: field[begun]))
+        begun_states = self._last_latent.map(lambda field: field[begun])
+        means, _ = self.policy.cost_critic(self.policy.world_model.features(begun_states), begun_states.action)
         self.penalty.note_prediction(means.mean(0))
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
@@ -194,8 +195,8 @@ class ESADLEND(LatentAlgorithm):
         recorded_targets = recorded_return_targets(self.policy, recorded, self.gamma)
         critic = self.policy.critic
         critic.follow_scale(targets)
-        dreamed = (imagined.weights.flatten() * critic.loss(imagined_transitions(imagined), targets.flatten())).mean()
-        anchored = (recorded.event_weights * critic.loss(recorded.states, recorded_targets)).mean()
+        dreamed = (imagined.weights.flatten() * critic.loss(*taken(imagined), targets.flatten())).mean()
+        anchored = (recorded.event_weights * critic.loss(recorded.grids, recorded.actions, recorded_targets)).mean()
         self._step(critic, dreamed + self.replay_critic_coef * anchored)
         return {
             "critic_loss": dreamed.item(),
@@ -213,8 +214,8 @@ class ESADLEND(LatentAlgorithm):
         targets = cost_targets(self.policy, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
         anchors = recorded_cost_targets(self.policy, recorded, self._cost_gamma)
         weights = imagined.weights.flatten()
-        mean_loss, variance_loss = critic.loss(imagined_transitions(imagined), *(each.flatten() for each in targets))
-        anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.states, *anchors)
+        mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
+        anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
         dreamed = (weights * (mean_loss + variance_loss)).mean()
         anchored = (recorded.event_weights * (anchor_mean_loss + anchor_variance_loss)).mean()
         self._step(critic, dreamed + self.replay_cost_critic_coef * anchored)
@@ -226,11 +227,10 @@ class ESADLEND(LatentAlgorithm):
         }
 
     def _update_actor(self, imagined: Imagination) -> Logs:
-        states = imagined_transitions(imagined)
-        actions, log_prob = self.policy.actor.action_log_prob(states)
-        chosen = states._replace(action=actions)
-        value = self.policy.critic(chosen).min(0).values
-        risk = self.risk(chosen)
+        grids, _ = taken(imagined)
+        actions, log_prob = self.policy.actor.action_log_prob(grids)
+        value = self.policy.critic(grids, actions).min(0).values
+        risk = self.risk(grids, actions)
         barrier = self._barrier(risk.detach().view_as(imagined.weights))
         objective = self.entropy() * log_prob - value / self.policy.critic.scale
         loss = (imagined.weights.flatten() * self.penalty.combine(objective, risk, barrier.flatten())).mean()
@@ -246,14 +246,15 @@ class ESADLEND(LatentAlgorithm):
             **self.entropy.update(log_prob),
         }
 
-    def risk(self, states: LatentState) -> th.Tensor:
+    def risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
         Safety measure Gamma: conditional value at risk of the cost to come, by the more pessimistic critic.
 
-        :param states: N states and their actions
+        :param grids: features of N states, of shape (N, C, H, W)
+        :param actions: their actions, of shape (N, A)
         :return: shape (N,)
         """
-        means, variance = self.policy.cost_critic(states)
+        means, variance = self.policy.cost_critic(grids, actions)
         return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic.bound).max(0).values
 
     def _barrier(self, risk: th.Tensor) -> th.Tensor:

@@ -12,21 +12,25 @@ from sb3_esad.common.functional import (
 )
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
-from sb3_esad.common.type_aliases import Imagination, LatentState, Predictions, SequenceSamples
+from sb3_esad.common.type_aliases import Imagination, Predictions, SequenceSamples
 
 
 class Transitions(NamedTuple):
     """
     N steps with the states before and after.
 
-    :param states: with the executed actions
-    :param next_states: with actions of the present policy
+    :param grids: features of the states, of shape (N, C, H, W)
+    :param actions: executed in them, of shape (N, A)
+    :param next_grids: features of the states reached, of shape (N, C, H, W)
+    :param next_actions: of the present policy, of shape (N, A)
     :param outcomes: reward, cost and continuation of the step, fields of shape (N,)
     :param event_weights: correct the over-representation of costs, of shape (N,)
     """
 
-    states: LatentState
-    next_states: LatentState
+    grids: th.Tensor
+    actions: th.Tensor
+    next_grids: th.Tensor
+    next_actions: th.Tensor
     outcomes: Predictions
     event_weights: th.Tensor
 
@@ -53,20 +57,31 @@ def recorded_transitions(policy: LatentPolicy, samples: SequenceSamples, filtere
     :param filtered: their states
     :return: B * T transitions
     """
-    states, reached = (state.map(lambda field: field.flatten(0, 1)) for state in (filtered.before, filtered.states))
+    before, after = (state.map(lambda field: field.flatten(0, 1)) for state in (filtered.before, filtered.states))
+    grids, next_grids = policy.world_model.features(before), policy.world_model.features(after)
     outcomes = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
     weights = samples.event_weights.expand_as(samples.rewards.T).flatten()
-    return Transitions(states, reached._replace(action=policy.actor(reached)), outcomes, weights)
+    return Transitions(grids, before.action, next_grids, policy.actor(next_grids), outcomes, weights)
 
 
-def imagined_transitions(imagined: Imagination) -> LatentState:
+def taken(imagined: Imagination) -> tuple[th.Tensor, th.Tensor]:
     """
-    Line up the states from which imagined steps were made.
+    Line up the imagined steps.
 
     :param imagined: trajectories of H steps
-    :return: H * N states with their actions
+    :return: features of the H * N states and the actions taken in them
     """
-    return imagined.states.map(lambda field: field[:-1].flatten(0, 1))
+    return imagined.grids[:-1].flatten(0, 1), imagined.actions[:-1].flatten(0, 1)
+
+
+def reached(imagined: Imagination) -> tuple[th.Tensor, th.Tensor]:
+    """
+    Line up the states that the imagined steps reach.
+
+    :param imagined: trajectories of H steps
+    :return: features of the H * N states and the actions that follow
+    """
+    return imagined.grids[1:].flatten(0, 1), imagined.actions[1:].flatten(0, 1)
 
 
 @th.no_grad()
@@ -80,9 +95,8 @@ def return_targets(policy: LatentPolicy, imagined: Imagination, gamma: float, la
     :param lambda_: mixing of n-step returns
     :return: shape (H, N)
     """
-    reached = imagined.states.map(lambda field: field[1:].flatten(0, 1))
     rewards, _, continues = imagined.predictions
-    values = policy.critic_target(reached).min(0).values.view_as(rewards)
+    values = policy.critic_target(*reached(imagined)).min(0).values.view_as(rewards)
     return lambda_return(rewards.T, continues.T, values.T, gamma, lambda_).T
 
 
@@ -100,11 +114,10 @@ def cost_targets(
     :param continue_after_cost: how often an episode goes on after a cost
     :return: fields of shape (H, N)
     """
-    reached = imagined.states.map(lambda field: field[1:].flatten(0, 1))
     _, costs, continues = imagined.predictions
-    next_means, next_variances = policy.cost_critic_target(reached)
+    next_means, next_variances = policy.cost_critic_target(*reached(imagined))
     next_mean, next_variance = next_means.mean(0).view_as(costs), next_variances.view_as(costs)
-    means, _ = policy.cost_critic(imagined_transitions(imagined))
+    means, _ = policy.cost_critic(*taken(imagined))
     joint = indicator_joint(costs, continues, continue_after_cost)
     error = expected_squared_error(costs, costs, joint, continues, means.mean(0).view_as(costs), next_mean, gamma)
     return CostTargets(
@@ -124,7 +137,7 @@ def recorded_return_targets(policy: LatentPolicy, recorded: Transitions, gamma: 
     :return: shape (N,)
     """
     rewards, _, continues = recorded.outcomes
-    return rewards + gamma * continues * policy.critic_target(recorded.next_states).min(0).values
+    return rewards + gamma * continues * policy.critic_target(recorded.next_grids, recorded.next_actions).min(0).values
 
 
 @th.no_grad()
@@ -138,9 +151,9 @@ def recorded_cost_targets(policy: LatentPolicy, recorded: Transitions, gamma: fl
     :return: fields of shape (N,)
     """
     _, costs, continues = recorded.outcomes
-    next_means, next_variance = policy.cost_critic_target(recorded.next_states)
+    next_means, next_variance = policy.cost_critic_target(recorded.next_grids, recorded.next_actions)
     next_mean = next_means.mean(0)
-    mean = policy.cost_critic(recorded.states)[0].mean(0)
+    mean = policy.cost_critic(recorded.grids, recorded.actions)[0].mean(0)
     return CostTargets(
         costs + gamma * continues * next_mean,
         sampled_variance_target(costs, continues, mean, next_mean, next_variance, gamma),

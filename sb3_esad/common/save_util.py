@@ -1,0 +1,97 @@
+"""Files that are there as a whole or not at all, and saved models that are refused with a reason."""
+
+import io
+import json
+import os
+import pathlib
+import zipfile
+import zlib
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any
+
+Target = str | pathlib.Path | io.BufferedIOBase
+
+
+@contextmanager
+def whole_file(path: Target, suffix: str = "") -> Iterator[Target]:
+    """
+    Write to a temporary file beside the wanted one, which it replaces once it is complete.
+
+    :param path: where the file shall be, its folder is made; a file-like object is handed on as it is
+    :param suffix: added to a path that has none, as SB3 does, with its dot
+    :return: what to write to; its suffix is that of the wanted file
+    """
+    if not isinstance(path, str | pathlib.Path):
+        yield path
+        return
+    wanted = with_suffix(path, suffix)
+    wanted.parent.mkdir(parents=True, exist_ok=True)
+    unfinished = wanted.with_name(f".{os.getpid()}.{wanted.name}")
+    try:
+        yield unfinished
+        os.replace(unfinished, wanted)
+    finally:
+        unfinished.unlink(missing_ok=True)
+
+
+def with_suffix(path: str | pathlib.Path, suffix: str) -> pathlib.Path:
+    """
+    Add a suffix to a path that has none.
+
+    :param path: any path
+    :param suffix: with its dot, or empty
+    :return: the path as SB3 would write it
+    """
+    path = pathlib.Path(path)
+    return path if path.suffix else pathlib.Path(f"{path}{suffix}")
+
+
+def check_saved_model(path: Target, algorithm: str, mark: str) -> None:
+    """
+    Refuse a file that holds no model of an algorithm.
+
+    :param path: file or file-like object, at whose start it is left; SB3's ``.zip`` may be missing
+    :param algorithm: name of the class that shall load it
+    :param mark: an attribute that only models of this kind have
+    :raises ValueError: if it is missing, no zip, damaged, no model of SB3, or one of another algorithm
+    """
+    if not isinstance(path, str | pathlib.Path):
+        _check_archive(path, getattr(path, "name", "the given file object"), algorithm, mark)
+        path.seek(0)
+        return
+    found = next((each for each in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if each.is_file()), None)
+    if found is None:
+        raise ValueError(f"There is no file {path}: give the zip that {algorithm}.save() or the training has written.")
+    with found.open("rb") as file:
+        _check_archive(file, str(found), algorithm, mark)
+
+
+def _check_archive(file: Any, name: str, algorithm: str, mark: str) -> None:
+    starts_like_zip = file.read(2) == b"PK"
+    file.seek(0)
+    if not starts_like_zip:
+        raise ValueError(f"{name} is no zip file: give the zip that {algorithm}.save() has written.")
+    try:
+        with zipfile.ZipFile(file) as archive:
+            damaged = archive.testzip()
+            members = archive.namelist()
+            data = json.loads(archive.read("data")) if damaged is None and "data" in members else {}
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
+        raise ValueError(f"{name} is cut off or damaged ({error}): save or copy it again.") from error
+    if damaged is not None:
+        raise ValueError(f"{name} is damaged at its member '{damaged}': save or copy it again.")
+    if "data" not in members or "policy.pth" not in members:
+        raise ValueError(
+            f"{name} is a zip but holds no model of Stable-Baselines3: give the zip that {algorithm}.save() has written."
+        )
+    if mark not in data:
+        raise ValueError(
+            f"{name} holds no {algorithm} but a model with {_policy_of(data)}: load it with the class that saved it."
+        )
+
+
+def _policy_of(data: dict[str, Any]) -> str:
+    """Name of the policy's module as SB3 notes it in plain text, for a message."""
+    entry = data.get("policy_class")
+    return f"a policy of {entry['__module__']}" if isinstance(entry, dict) and "__module__" in entry else "an unknown policy"
