@@ -265,7 +265,7 @@ def test_time_to_event_in_samples() -> None:
 
 def test_continue_after_cost_counts_steps() -> None:
     buffer = make_buffer(make_env())
-    add_costs(buffer, np.array([[1.0], [0.0], [1.0], [2.0], [1.0]]), np.array([[0], [0], [1], [1], [0]]))
+    add_costs(buffer, np.array([[1.0], [0.0], [1.0], [0.2], [1.0]]), np.array([[0], [0], [1], [1], [0]]))
     assert buffer.continue_after_cost == 0.5
 
 

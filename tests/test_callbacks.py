@@ -8,6 +8,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from stable_baselines3 import SAC
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback, CallbackList, EvalCallback
 from stable_baselines3.common.logger import KVWriter, Logger
 from stable_baselines3.common.monitor import Monitor
@@ -16,6 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_esad.common import callbacks as callbacks_module
 from sb3_esad.common.callbacks import CostEvalCallback, LagrangeCallback, prepend
+from sb3_esad.common.costs import CostReader
 from sb3_esad.common.evaluation import evaluate_policy
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from tests.conftest import CountingEnv
@@ -38,10 +40,18 @@ class RecordingPenalty(AugmentedLagrangian):
         return super().update(violation, gradient_steps)
 
 
+class CostReplayBuffer(ReplayBuffer):
+    """SB3's buffer that knows how to read costs."""
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **kwargs)
+        self.read_costs = CostReader()
+
+
 class SafeSAC(SAC):
     """The smallest algorithm with a penalty."""
 
-    cost_key = "cost"
+    replay_buffer: CostReplayBuffer
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -62,7 +72,7 @@ class SafeSAC(SAC):
 
 def make_model(env: gym.Env | DummyVecEnv | None = None, **kwargs: Any) -> SafeSAC:
     settings: dict[str, Any] = {"learning_starts": 10, "buffer_size": 100, "batch_size": 4, "train_freq": 5}
-    net = {"policy_kwargs": {"net_arch": [8]}, "device": "cpu", "seed": 0}
+    net = {"policy_kwargs": {"net_arch": [8]}, "replay_buffer_class": CostReplayBuffer, "device": "cpu", "seed": 0}
     return SafeSAC("MlpPolicy", env or CountingEnv(), **{**settings, **net, **kwargs})
 
 

@@ -11,7 +11,7 @@ from sb3_esad.common.costs import CostReader, EpisodeCosts, read_costs
 
 def test_reads_numbers_and_bools() -> None:
     infos: list[dict[str, Any]] = [
-        {"cost": 2},
+        {"cost": 1},
         {"cost": True},
         {"cost": np.float64(0.5)},
         {"cost": np.array(0.25)},
@@ -19,7 +19,7 @@ def test_reads_numbers_and_bools() -> None:
     ]
     costs = read_costs(infos)
     assert costs.dtype == np.float32
-    assert costs.tolist() == [2.0, 1.0, 0.5, 0.25, 0.0]
+    assert costs.tolist() == [1.0, 1.0, 0.5, 0.25, 0.0]
     assert read_costs([{"crashed": True, "cost": 0.0}], cost_key="crashed").tolist() == [1.0]
 
 
@@ -40,8 +40,18 @@ def test_missing_cost_points_to_crashed() -> None:
 
 @pytest.mark.parametrize("cost", [float("nan"), float("inf"), -1.0, [1.0], np.zeros(2), np.zeros(1), "high", None, {}])
 def test_refuses_what_is_not_a_cost(cost: Any) -> None:
-    with pytest.raises(ValueError, match=r'^info\["cost"\] is .*; a cost must be one finite number >= 0 or a bool\.$'):
+    with pytest.raises(ValueError, match=r'^info\["cost"\] is .*; a cost must be one number from 0 to 1, or a bool\.$'):
         read_costs([{"cost": cost}])
+
+
+@pytest.mark.parametrize("cost", [2, 1.001, np.float32(25.0)])
+def test_costs_above_one_are_to_be_divided(cost: Any) -> None:
+    with pytest.raises(ValueError, match="divide all costs and cost_limit by the largest possible cost"):
+        read_costs([{"cost": cost}])
+
+
+def test_rounding_is_no_cost_above_one() -> None:
+    assert read_costs([{"cost": 1.0 + 1e-12}]).tolist() == [1.0]
 
 
 def test_episode_costs() -> None:
@@ -51,6 +61,13 @@ def test_episode_costs() -> None:
     assert first == (0, 2.0, 1.5, 2)
     both = episodes.add(np.array([0.0, 4.0]), np.array([True, True]))
     assert both == [(0, 0.0, 0.0, 1), (1, 8.0, 3.0, 3)]
+
+
+def test_unfinished_episodes_can_be_forgotten() -> None:
+    episodes = EpisodeCosts()
+    episodes.add(np.ones(1), np.zeros(1, dtype=bool))
+    episodes.clear()
+    assert episodes.add(np.ones(1), np.ones(1, dtype=bool)) == [(0, 1.0, 1.0, 1)]
 
 
 def test_episode_costs_start_afresh_with_another_number_of_environments() -> None:

@@ -56,6 +56,9 @@ def test_save_and_load_paths(model: ESADLEND, tmp_path: Path, name: str, kind: t
         assert ESADLEND.load(kind(path)).cost_limit == model.cost_limit
 
 
+@pytest.mark.filterwarnings(
+    "ignore::pytest.PytestUnraisableExceptionWarning"
+)  # SB3 does not close the file that it could not write
 def test_save_keeps_the_old_model_at_a_failure(model: ESADLEND, saved: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     before = saved.read_bytes()
     monkeypatch.setattr(model, "get_parameters", lambda: {"policy": lambda: "cannot be pickled"})
@@ -99,7 +102,10 @@ def test_load_refuses_what_is_no_zip(tmp_path: Path, content: bytes) -> None:
 def test_load_refuses_a_truncated_zip(saved: Path, share: float) -> None:
     content = saved.read_bytes()
     saved.write_bytes(content[: int(share * len(content))])
-    with pytest.raises(ValueError, match=r"model\.zip is cut off or damaged .*: save or copy it again"):
+    # The members are zips themselves: where one of them ends, the file looks complete
+    with pytest.raises(
+        ValueError, match=r"model\.zip (is cut off or damaged .*: save or copy it again|.* only a part of one)"
+    ):
         ESADLEND.load(saved)
 
 
@@ -119,7 +125,7 @@ def test_load_refuses_a_zip_without_a_model(tmp_path: Path, members: dict[str, s
         archive.writestr("readme.txt", "hello")
         for name, text in members.items():
             archive.writestr(name, text)
-    with pytest.raises(ValueError, match=r"photos\.zip is a zip but holds no model of Stable-Baselines3"):
+    with pytest.raises(ValueError, match=r"photos\.zip holds no model of Stable-Baselines3"):
         ESADLEND.load(path)
 
 

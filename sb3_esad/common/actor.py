@@ -2,14 +2,13 @@
 
 import torch as th
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
-from torch import nn
 
-from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
+from sb3_esad.common.torch_layers import GridReadout, GridShape, LearningModule, mlp
 
 LOG_STD_MIN, LOG_STD_MAX = -3.0, 1.0
 
 
-class Actor(nn.Module):
+class Actor(LearningModule):
     """
     Policy on latent states, in actions scaled to [-1, 1].
 
@@ -17,8 +16,6 @@ class Actor(nn.Module):
     :param action_dim: length of the action
     :param net_arch: hidden layers; the first entry is the length of the readout too
     """
-
-    optimizer: th.optim.Optimizer
 
     def __init__(self, grid_shape: GridShape, action_dim: int, net_arch: list[int]) -> None:
         super().__init__()

@@ -26,10 +26,11 @@ def prepend(first: BaseCallback, callback: MaybeCallback) -> list[BaseCallback]:
 
 class LagrangeCallback(BaseCallback):
     """
-    Shows the penalty the costs of every step and lets it move its multiplier once per collected rollout.
+    Shows the penalty the costs of every step of the policy and lets it move its multiplier once per collected rollout.
 
-    The model has a ``penalty``, a ``replay_buffer`` that reads costs and a ``take_violation()`` that returns the mean of Gamma - d since its last
-    call, or None if there was no update. Everything that must be remembered is in the penalty, which is saved with the model.
+    The model has a ``penalty``, a ``replay_buffer`` that reads costs and a ``take_violation()`` that returns the mean of
+    Gamma - d since its last call, or None if there was no update. Everything that must be remembered is in the penalty,
+    which is saved with the model.
     """
 
     model: Any
@@ -37,8 +38,14 @@ class LagrangeCallback(BaseCallback):
     def _init_callback(self) -> None:
         self._n_updates_seen = self.model._n_updates
 
+    def _on_training_start(self) -> None:
+        if self.model._last_episode_starts.all():
+            self.model.penalty.forget_unfinished()
+
     def _on_step(self) -> bool:
-        self.model.penalty.observe(self.model.replay_buffer.read_costs(self.locals["infos"]), self.locals["dones"])
+        # What random actions have cost says nothing about the policy
+        if self.num_timesteps > self.model.learning_starts:
+            self.model.penalty.observe(self.model.replay_buffer.read_costs(self.locals["infos"]), self.locals["dones"])
         return True
 
     def _on_rollout_end(self) -> None:

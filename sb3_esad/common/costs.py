@@ -1,7 +1,7 @@
 """Costs reach the algorithms through the info dict of the environment, and only here."""
 
 import warnings
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, NoReturn
 
 import numpy as np
 
@@ -12,7 +12,7 @@ class CostReader:
 
     A missing cost counts as zero, with one warning for each reader.
 
-    :param cost_key: key of the cost in the info dict; its value is a bool or a finite number >= 0
+    :param cost_key: key of the cost in the info dict; its value is a bool or a number in [0, 1]
     """
 
     def __init__(self, cost_key: str = "cost") -> None:
@@ -25,7 +25,7 @@ class CostReader:
 
         :param infos: info dicts of one step, one for each environment
         :return: (n_envs,) float32
-        :raises ValueError: if a cost is not one finite number >= 0
+        :raises ValueError: if a cost is not one number in [0, 1]
         """
         return np.array([self._read(info) for info in infos], dtype=np.float32)
 
@@ -35,10 +35,13 @@ class CostReader:
             return 0.0
         cost = np.asarray(info[self.cost_key])
         if cost.ndim > 0 or cost.dtype.kind not in "biuf" or not np.isfinite(cost) or cost < 0:
-            raise ValueError(
-                f'info["{self.cost_key}"] is {info[self.cost_key]!r}; a cost must be one finite number >= 0 or a bool.'
-            )
+            self._refuse(info, "a cost must be one number from 0 to 1, or a bool")
+        if np.float32(cost) > 1:
+            self._refuse(info, "a cost must not exceed 1: divide all costs and cost_limit by the largest possible cost")
         return float(cost)
+
+    def _refuse(self, info: dict[str, Any], reason: str) -> NoReturn:
+        raise ValueError(f'info["{self.cost_key}"] is {info[self.cost_key]!r}; {reason}.')
 
     def _warn_missing(self, info: dict[str, Any]) -> None:
         if self._warned:
@@ -55,7 +58,7 @@ def read_costs(infos: list[dict[str, Any]], cost_key: str = "cost") -> np.ndarra
     :param infos: info dicts of one step, one for each environment
     :param cost_key: key of the cost in the info dict
     :return: (n_envs,) float32, 0 where the key is missing
-    :raises ValueError: if a cost is not one finite number >= 0
+    :raises ValueError: if a cost is not one number in [0, 1]
     """
     return CostReader(cost_key)(infos)
 
@@ -85,6 +88,10 @@ class EpisodeCosts:
 
     def __init__(self, discount: float = 1.0) -> None:
         self.discount = discount
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop the episodes under way, for the environments have been reset."""
         self._start(0)
 
     def _start(self, n_envs: int) -> None:

@@ -7,7 +7,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.heads import ValueDistribution
-from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
+from sb3_esad.common.torch_layers import GridReadout, GridShape, LearningModule, mlp
 
 MIN_VARIANCE = 1e-4
 Module = TypeVar("Module", bound=nn.Module)
@@ -48,7 +48,7 @@ class StateActionFeatures(nn.Module):
         return th.cat([self.readout(grid), action], dim=1)
 
 
-class QEnsemble(nn.Module):
+class QEnsemble(LearningModule):
     """
     Several critics of the discounted return on one readout, as SB3's critics share a features extractor.
 
@@ -58,7 +58,7 @@ class QEnsemble(nn.Module):
     :param n_critics: size of the ensemble
     """
 
-    optimizer: th.optim.Optimizer
+    scale: th.Tensor
 
     def __init__(self, grid_shape: GridShape, action_dim: int, net_arch: list[int], n_critics: int = 2) -> None:
         super().__init__()
@@ -113,7 +113,7 @@ class QEnsemble(nn.Module):
         return self.distribution.loss(self.logits(grid, action), targets.expand(len(self.q_networks), -1)).sum(0)
 
 
-class CostCritic(nn.Module):
+class CostCritic(LearningModule):
     """
     Mean and variance of the discounted cost: an ensemble for the mean, one network for the variance.
 
@@ -123,7 +123,7 @@ class CostCritic(nn.Module):
     :param n_critics: size of the ensemble of means
     """
 
-    optimizer: th.optim.Optimizer
+    bound: th.Tensor
 
     def __init__(self, grid_shape: GridShape, action_dim: int, net_arch: list[int], n_critics: int = 2) -> None:
         super().__init__()
@@ -144,7 +144,8 @@ class CostCritic(nn.Module):
         """
         if bound > self.bound:
             for network in self.means:
-                network[-1].bias -= th.log(bound / self.bound)  # so that small estimates stay what they are
+                *_, output_bias = network.parameters()
+                output_bias.sub_(th.log(bound / self.bound))  # so that small estimates stay what they are
             self.bound.fill_(bound)
 
     def forward(self, grid: th.Tensor, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
@@ -177,7 +178,8 @@ class CostCritic(nn.Module):
         """
         Cross-entropy of the means and squared error of the variance.
 
-        Not the 2-Wasserstein distance of arXiv 2407.06317: on sampled targets it converges to a fraction of the true deviation.
+        Not the 2-Wasserstein distance of arXiv 2407.06317: on sampled targets it converges to a fraction of the true
+        deviation.
 
         :param grid: features of N states, of shape (N, C, H, W)
         :param action: their actions, of shape (N, A)

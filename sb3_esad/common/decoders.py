@@ -1,6 +1,7 @@
 """What a latent state looks like: reconstructions of images and vectors, and how wrong they are."""
 
 import math
+from abc import ABC, abstractmethod
 
 import torch as th
 from torch import nn
@@ -12,7 +13,30 @@ FOREGROUND_CONTRAST = 0.1
 MEDIAN_SAMPLE = 32
 
 
-class ImageHead(nn.Module):
+class ObservationHead(nn.Module, ABC):
+    """Reconstruction of one observation."""
+
+    @abstractmethod
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Reconstruct.
+
+        :param grid: latent states, of shape (N, C, H, W)
+        :return: preprocessed observations, of shape (N, ...)
+        """
+
+    @abstractmethod
+    def loss(self, grid: th.Tensor, observations: th.Tensor) -> th.Tensor:
+        """
+        Measure how wrong the reconstruction is.
+
+        :param grid: latent states, of shape (N, C, H, W)
+        :param observations: preprocessed, of shape (N, ...)
+        :return: scalar
+        """
+
+
+class ImageHead(ObservationHead):
     """
     Reconstruct an image, with more weight on the pixels that differ from the usual background.
 
@@ -50,21 +74,21 @@ class ImageHead(nn.Module):
         _, height, width = self.image_shape
         return nn.functional.pixel_shuffle(self._patches(grid).movedim(-1, 1), 4)[..., :height, :width]
 
-    def loss(self, grid: th.Tensor, images: th.Tensor) -> th.Tensor:
+    def loss(self, grid: th.Tensor, observations: th.Tensor) -> th.Tensor:
         """
         Sum the weighted squared error over pixels, average it over the batch.
 
         :param grid: latent states, of shape (N, C, H, W)
-        :param images: preprocessed images, of shape (N, *image_shape)
+        :param observations: preprocessed images, of shape (N, *image_shape)
         :return: scalar
         """
         _, height, width = self.image_shape
-        padded = nn.functional.pad(images, (0, -width % 8, 0, -height % 8))
+        padded = nn.functional.pad(observations, (0, -width % 8, 0, -height % 8))
         patches = nn.functional.pixel_unshuffle(padded, 4).movedim(1, -1).contiguous()
         self._follow_median(patches[:: math.ceil(len(patches) / MEDIAN_SAMPLE)])
         foreground = (patches - self.background.to(patches.dtype)).abs() > FOREGROUND_CONTRAST
         weights = 1 + self.foreground_weight * foreground.to(patches.dtype)
-        return (weights * (self._patches(grid) - patches).square()).sum(dtype=th.float32) / len(images)
+        return (weights * (self._patches(grid) - patches).square()).sum(dtype=th.float32) / len(observations)
 
     def _patches(self, grid: th.Tensor) -> th.Tensor:
         """Patches of 4x4 pixels, of shape (N, rows, columns, 16 * channels)."""
@@ -78,7 +102,7 @@ class ImageHead(nn.Module):
         self.background += rate * (patches - self.background).sign().mean(0)
 
 
-class VectorHead(nn.Module):
+class VectorHead(ObservationHead):
     """
     Reconstruct a flat observation as its symmetric logarithm.
 
@@ -100,12 +124,12 @@ class VectorHead(nn.Module):
         """
         return symexp(self.layers(grid))
 
-    def loss(self, grid: th.Tensor, vectors: th.Tensor) -> th.Tensor:
+    def loss(self, grid: th.Tensor, observations: th.Tensor) -> th.Tensor:
         """
         Sum the squared error over entries, average it over the batch.
 
         :param grid: latent states, of shape (N, C, H, W)
-        :param vectors: preprocessed observations, of shape (N, ...)
+        :param observations: preprocessed, of shape (N, ...)
         :return: scalar
         """
-        return (self.layers(grid).float() - symlog(vectors.flatten(1))).square().sum(1).mean()
+        return (self.layers(grid).float() - symlog(observations.flatten(1))).square().sum(1).mean()

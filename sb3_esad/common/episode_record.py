@@ -7,6 +7,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.costs import EpisodeCosts, FinishedEpisode
+from sb3_esad.common.functional import capped_cvar
 
 
 class EpisodeRecord(nn.Module):
@@ -26,7 +27,11 @@ class EpisodeRecord(nn.Module):
     prediction_sum: th.Tensor
     prediction_weight: th.Tensor
 
+    cost_rate: th.Tensor
+    rate_weight: th.Tensor
+
     prediction_decay = 0.99
+    rate_steps = 2000
 
     def __init__(self, cost_gamma: float, episode_length: float, window: int) -> None:
         super().__init__()
@@ -37,6 +42,8 @@ class EpisodeRecord(nn.Module):
         self.register_buffer("n_episodes", th.zeros(()))
         self.register_buffer("n_cost_free", th.zeros(()))
         self.register_buffer("mean_length", th.tensor(float(episode_length)))
+        self.register_buffer("cost_rate", th.zeros(()))
+        self.register_buffer("rate_weight", th.zeros(()))
         self.register_buffer("prediction_sum", th.zeros(()))
         self.register_buffer("prediction_weight", th.zeros(()))
 
@@ -57,8 +64,15 @@ class EpisodeRecord(nn.Module):
         :param costs: (n_envs,)
         :param dones: (n_envs,)
         """
+        share = min(len(costs) / self.rate_steps, 1.0)
+        self.cost_rate += share * (float(np.mean(costs)) - self.cost_rate)
+        self.rate_weight += share * (1.0 - self.rate_weight)
         for episode in self._under_way.add(costs, dones):
             self._remember(episode)
+
+    def forget_unfinished(self) -> None:
+        """Drop the episodes under way, for the environments have been reset."""
+        self._under_way.clear()
 
     def _remember(self, episode: FinishedEpisode) -> None:
         slot = int(self.n_episodes) % self.window
@@ -97,12 +111,28 @@ class EpisodeRecord(nn.Module):
         observed = self.discounted_costs[: self.size].mean().item() if self.size else 0.0
         return (predicted + epsilon) / (observed + epsilon)
 
+    @property
+    def seen(self) -> float:
+        """How full the moving average of the cost rate is, from 0 to 1."""
+        return self.rate_weight.item()
+
+    @property
+    def expected_cost(self) -> float:
+        """
+        Cost of an episode of full length at the present rate.
+
+        Not the mean of the latest episodes: once the agent drives well, each lasts long, and crashes of a policy that is gone
+        would count for thousands of steps.
+        """
+        return self.cost_rate.item() / max(self.rate_weight.item(), 1e-8) * self.episode_length
+
     def tail_cost(self, risk_level: float) -> float:
         """
-        Empirical conditional value at risk of the episode cost.
+        Conditional value at risk of the episode cost at the present rate.
 
         :param risk_level: alpha in (0, 1]
-        :return: mean of the worst fraction alpha of the remembered episodes, of which there must be one
+        :return: capped CVaR with the spread of the remembered episodes
         """
-        n_worst = math.ceil(risk_level * self.size)
-        return self.costs[: self.size].topk(n_worst).values.mean().item()
+        variance = self.costs[: max(self.size, 1)].var(correction=0)
+        mean = th.as_tensor(self.expected_cost)
+        return capped_cvar(mean, variance.to(mean.device), risk_level, math.inf).item()

@@ -2,7 +2,6 @@
 
 import math
 
-import numpy as np
 import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space
@@ -10,24 +9,29 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
 from sb3_esad.common.functional import symlog
-from sb3_esad.common.torch_layers import ChannelNorm, GridShape, conv_block, mlp
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, mlp
 
 MIN_PIXELS = 16
 
 
-def check_image_size(space: spaces.Space, name: str) -> None:
+def check_image(space: spaces.Space, normalized_image: bool) -> tuple[int, int, int]:
     """
-    Refuse images that are too small to be divided into cells.
+    Refuse what is no image, and images that are too small to be divided into cells.
 
     :param space: channel-first image space
-    :param name: how to call the observation in the message
-    :raises ValueError: if height or width is below 16 pixels
+    :param normalized_image: whether images are floats already
+    :return: channels, height and width
+    :raises ValueError: if the space is no image space, or if height or width is below 16 pixels
     """
-    if min(space.shape[1:]) < MIN_PIXELS:
-        raise ValueError(
-            f"The {name} of shape {space.shape} (channels, height, width) is too small: the encoder needs at least "
-            f"{MIN_PIXELS}x{MIN_PIXELS} pixels, so render it larger or use MlpPolicy on a vector."
-        )
+    if not is_image_space(space, normalized_image=normalized_image):
+        remedy = "use MlpPolicy or MultiInputPolicy, or normalize_images=False for images that are floats already"
+        raise ValueError(f"CnnPolicy needs images of bytes from 0 to 255, not {space}: {remedy}.")
+    assert space.shape is not None
+    channels, height, width = space.shape
+    if min(height, width) < MIN_PIXELS:
+        needed = f"the encoder needs at least {MIN_PIXELS}x{MIN_PIXELS} pixels, so render it larger or use MlpPolicy"
+        raise ValueError(f"The image of shape {space.shape} (channels, height, width) is too small: {needed}.")
+    return channels, height, width
 
 
 class SpatialCnn(BaseFeaturesExtractor):
@@ -37,18 +41,16 @@ class SpatialCnn(BaseFeaturesExtractor):
     :param observation_space: channel-first image space
     :param channels: channels of each cell
     :param hidden_channels: channels of the hidden layer, whose cells are 4x4 pixels
-    :param normalized_image: whether the images are floats already, then any number of channels is taken
-    :raises ValueError: if the image is smaller than 16x16 pixels
+    :param normalized_image: whether the images are floats already
+    :raises ValueError: if the space is no image space, or the image smaller than 16x16 pixels
     """
 
     def __init__(
-        self, observation_space: spaces.Box, channels: int = 48, hidden_channels: int = 32, normalized_image: bool = False
+        self, observation_space: spaces.Space, channels: int = 48, hidden_channels: int = 32, normalized_image: bool = False
     ) -> None:
-        check_image_size(observation_space, "image")
-        image_channels, height, width = observation_space.shape
+        image_channels, height, width = check_image(observation_space, normalized_image)
         self.grid_shape: GridShape = (channels, math.ceil(height / 8), math.ceil(width / 8))
         super().__init__(observation_space, math.prod(self.grid_shape))
-        self.normalized_image = normalized_image
         self.layers = nn.Sequential(
             nn.ZeroPad2d((0, -width % 8, 0, -height % 8)),
             nn.Conv2d(image_channels, hidden_channels, 4, stride=4),
@@ -101,16 +103,19 @@ class CombinedExtractor(BaseFeaturesExtractor):
     :param channels: channels of each image's cells
     :param vector_features: number of features of each vector
     :param normalized_image: whether the images are floats already
-    :raises ValueError: if an image is smaller than 16x16 pixels
+    :raises ValueError: if the space is no dictionary, or an image smaller than 16x16 pixels
     """
 
     def __init__(
-        self, observation_space: spaces.Dict, channels: int = 48, vector_features: int = 64, normalized_image: bool = False
+        self, observation_space: spaces.Space, channels: int = 48, vector_features: int = 64, normalized_image: bool = False
     ) -> None:
+        if not isinstance(observation_space, spaces.Dict):
+            raise ValueError(
+                f"MultiInputPolicy needs a Dict of observations, not {observation_space}: use MlpPolicy or CnnPolicy."
+            )
         extractors: dict[str, BaseFeaturesExtractor] = {}
         for key, space in observation_space.spaces.items():
             if is_image_space(space, normalized_image=normalized_image):
-                check_image_size(space, f"image '{key}'")
                 extractors[key] = SpatialCnn(space, channels, normalized_image=normalized_image)
             else:
                 extractors[key] = VectorExtractor(space, vector_features)
@@ -143,14 +148,3 @@ def grid_shape(extractor: BaseFeaturesExtractor) -> GridShape:
     :return: its own grid, or a single cell with all its features
     """
     return getattr(extractor, "grid_shape", (extractor.features_dim, 1, 1))
-
-
-def flat_shape(space: spaces.Space, image: bool) -> tuple[int, ...]:
-    """
-    Tell the shape of an observation after SB3's preprocessing.
-
-    :param space: a space of one observation (not a dictionary)
-    :param image: whether the space is an image
-    :return: its shape for images, (features,) otherwise
-    """
-    return tuple(np.array(space.shape).tolist()) if image else (get_flattened_obs_dim(space),)

@@ -42,7 +42,7 @@ def gaussian_cvar(mean: th.Tensor, variance: th.Tensor, risk_level: float) -> th
     return mean + factor * variance.sqrt() if factor > 0.0 else mean
 
 
-def capped_cvar(mean: th.Tensor, variance: th.Tensor, risk_level: float, cost_bound: float) -> th.Tensor:
+def capped_cvar(mean: th.Tensor, variance: th.Tensor, risk_level: float, cost_bound: float | th.Tensor) -> th.Tensor:
     """
     Gaussian conditional value at risk, kept below what any non-negative cost can reach.
 

@@ -17,6 +17,8 @@ class ValueDistribution(nn.Module):
     :param limit: the outermost bins stand for +-(exp(limit) - 1)
     """
 
+    bins: th.Tensor
+
     def __init__(self, n_bins: int = 101, limit: float = 10.0) -> None:
         super().__init__()
         self.n_bins = n_bins

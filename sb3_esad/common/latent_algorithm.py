@@ -10,6 +10,7 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
@@ -18,12 +19,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
+from sb3_esad.common.checks import require
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.save_util import check_saved_model, whole_file
+from sb3_esad.common.torch_layers import LearningModule
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
 
 SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
@@ -32,6 +35,13 @@ SETTLING_STEPS = 3
 """Steps after the start of a window before its states are trusted: speeds are not visible in a single frame."""
 EVENT_HORIZON = 8
 """Imagination also starts from states at most this many steps before a recorded cost."""
+NOT_OFFERED = {
+    "use_sde": "gSDE is not offered, pass an action_noise instead",
+    "sde_sample_freq": "gSDE is not offered, pass an action_noise instead",
+    "use_sde_at_warmup": "gSDE is not offered, set random_hold instead",
+    "n_steps": "n-step returns are mixed by lambda_return instead",
+}
+"""Arguments that other algorithms of SB3 have, and what to do without them."""
 
 
 class LatentAlgorithm(OffPolicyAlgorithm):
@@ -42,7 +52,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
     :param env: environment with a Box action space
     :param learning_rate: of all networks, a number or a function of the remaining progress
     :param buffer_size: number of steps to remember
-    :param learning_starts: steps of random actions, each held for ``random_hold`` steps, before learning
+    :param learning_starts: steps of random actions of random amplitude, each held for ``random_hold`` steps, before learning
     :param batch_size: windows in a batch
     :param sequence_length: steps in a window
     :param tau: share of the learned networks in their targets at each update
@@ -67,6 +77,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
     :param device: where to compute
     :param seed: of all random numbers
     :param _init_setup_model: whether to build the networks at once
+    :param unknown: refused; arguments of other SB3 algorithms with what to use instead
     :raises ValueError: if an argument is out of its range
     """
 
@@ -77,6 +88,8 @@ class LatentAlgorithm(OffPolicyAlgorithm):
     }
     policy: LatentPolicy
     replay_buffer: SequenceReplayBuffer
+    action_space: spaces.Box
+    _last_latent: LatentState | None
 
     def __init__(
         self,
@@ -99,7 +112,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         imagination_horizon: int = 12,
         imagination_starts: int = 256,
         lambda_return: float = 0.95,
-        random_hold: int = 5,
+        random_hold: int = 3,
         max_grad_norm: float = 100.0,
         cost_key: str = "cost",
         policy_kwargs: dict[str, Any] | None = None,
@@ -109,7 +122,9 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         device: th.device | str = "auto",
         seed: int | None = None,
         _init_setup_model: bool = True,
+        **unknown: Any,
     ) -> None:
+        _refuse_unknown(type(self).__name__, unknown)
         super().__init__(
             policy,
             env,
@@ -133,8 +148,8 @@ class LatentAlgorithm(OffPolicyAlgorithm):
             support_multi_env=True,
             seed=seed,
             sde_support=False,
-            supported_action_spaces=(spaces.Box,),
         )
+        self._check_action_space()
         self.sequence_length = sequence_length
         self.pretrain_steps = pretrain_steps
         self.imagination_horizon = imagination_horizon
@@ -147,7 +162,29 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
+    def _check_action_space(self) -> None:
+        if self.env is None:
+            return  # as in load: the spaces are those of the saved model
+        remedy = "with highway-env, configure its action as {'type': 'ContinuousAction'}, or wrap the environment"
+        message = f"{type(self).__name__} needs a Box of actions, not {self.action_space}: {remedy}."
+        assert isinstance(self.action_space, spaces.Box), message
+
+    def _check_arguments(self) -> None:
+        require(self.batch_size >= 1, "batch_size", self.batch_size, "a number of windows >= 1")
+        require(0 < self.tau <= 1, "tau", self.tau, "a share in (0, 1]")
+        require(0 <= self.gamma <= 1, "gamma", self.gamma, "a discount in [0, 1]")
+        require(0 <= self.lambda_return <= 1, "lambda_return", self.lambda_return, "a number in [0, 1]")
+        require(self.pretrain_steps >= 0, "pretrain_steps", self.pretrain_steps, "a number of updates >= 0")
+        require(self.imagination_horizon >= 1, "imagination_horizon", self.imagination_horizon, "a number of steps >= 1")
+        require(self.imagination_starts >= 2, "imagination_starts", self.imagination_starts, "a number of trajectories >= 2")
+        require(self.random_hold >= 1, "random_hold", self.random_hold, "a number of steps >= 1")
+        require(self.max_grad_norm > 0, "max_grad_norm", self.max_grad_norm, "a bound > 0")
+        buffer_class: Any = self.replay_buffer_class
+        fitting = issubclass(buffer_class, SequenceReplayBuffer)
+        require(fitting, "replay_buffer_class", buffer_class.__name__, "a SequenceReplayBuffer, which returns windows")
+
     def _setup_model(self) -> None:
+        self._check_arguments()
         self.replay_buffer_kwargs = {
             **self.replay_buffer_kwargs,
             "sequence_length": self.sequence_length,
@@ -155,7 +192,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         }
         super()._setup_model()
         keep_freed_memory()
-        self._last_latent: LatentState | None = None
+        self._last_latent = None
         self._random_actions: np.ndarray | None = None
         self._episode_costs = EpisodeCosts()
 
@@ -180,16 +217,27 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         starts = self._last_episode_starts
         if self._last_latent is None or starts is None:
             starts, self._last_latent = np.ones(n_envs, dtype=bool), self.policy.initial_state(n_envs)
+        assert self._last_obs is not None
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
         return self.policy.filter(observation, self._last_latent, th.as_tensor(starts, device=self.device), False)
 
     def _held_random_actions(self, n_envs: int) -> np.ndarray:
         if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:
             actions = np.stack([self.action_space.sample() for _ in range(n_envs)])
-            self._random_actions = self.policy.scale_action(actions).reshape(n_envs, -1).astype(np.float32)
+            scaled = self.policy.scale_action(actions).reshape(n_envs, -1)
+            # With a random amplitude: full strokes alone would end every episode within seconds and show little of the world
+            self._random_actions = (np.random.rand(n_envs, 1) * scaled).astype(np.float32)
         return self._random_actions
 
-    def _store_transition(self, replay_buffer, buffer_action, new_obs, reward, dones, infos) -> None:  # type: ignore[no-untyped-def, override]
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._last_episode_starts = dones
 
@@ -214,7 +262,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     # Learning
 
-    def learn(  # type: ignore[override]
+    def learn(
         self: SelfLatentAlgorithm,
         total_timesteps: int = 100_000,
         callback: MaybeCallback = None,
@@ -239,13 +287,16 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
         result = super()._setup_learn(*args, **kwargs)
-        observations = self._last_obs if isinstance(self._last_obs, dict) else {"observation": self._last_obs}
-        for key, images in observations.items():
-            if np.ndim(images) == 4 and np.max(images) == np.min(images):
-                raise ValueError(
-                    f"Every pixel of the first image '{key}' is {np.max(images)}: nothing can be learned from it. With highway-env, "
-                    "unset SDL_VIDEODRIVER (its value 'dummy' makes all images black)."
-                )
+        if self.num_timesteps == 0:
+            self.total_cost = 0.0
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        if self._last_episode_starts.all():
+            self._episode_costs.clear()
+        images = self.policy.world_model.images(self._last_obs)
+        blank = {key: batch.flat[0] for key, batch in images.items() if np.max(batch) == np.min(batch)}
+        remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
+        for key, value in blank.items():
+            raise ValueError(f"Every pixel of the first image '{key}' is {value}, nothing can be learned from it: {remedy}.")
         return result
 
     def train(self, gradient_steps: int, batch_size: int = 16) -> None:
@@ -290,7 +341,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         logs["model_grad_norm"] = self._step(self.policy.world_model, loss)
         return filtered.detach(), logs
 
-    def _step(self, network: th.nn.Module, loss: th.Tensor) -> float:
+    def _step(self, network: LearningModule, loss: th.Tensor) -> float:
         """Minimise a loss by one step of one network; whatever else it passed through gets no gradient."""
         parameters = list(network.parameters())
         network.optimizer.zero_grad()
@@ -310,13 +361,12 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     def _choose_starts(self, samples: SequenceSamples, filtered: Filtered) -> LatentState:
         """Half the starts come from uniformly drawn windows, half from shortly before a cost; the former stand first."""
-        eligible = filtered.settled(SETTLING_STEPS) & (samples.continues.T > 0)
+        eligible = filtered.settled(SETTLING_STEPS, samples.is_first.T)
         usual = (eligible & samples.uniform).float().flatten()
-        time_to_event = samples.time_to_event.T.flatten()
-        dangerous = eligible.flatten().float() * ((time_to_event > 0) & (time_to_event <= EVENT_HORIZON))
+        dangerous = (eligible & (samples.time_to_event.T < EVENT_HORIZON)).float().flatten()
         half = self.imagination_starts // 2
         chosen = th.cat([_draw(usual, half), _draw(dangerous if dangerous.any() else usual, self.imagination_starts - half)])
-        return filtered.states.map(lambda field: field.flatten(0, 1)[chosen])
+        return filtered.before.map(lambda field: field.flatten(0, 1)[chosen])
 
     def _record(self, logs: dict[str, list[float]]) -> None:
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -366,6 +416,13 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]
+
+
+def _refuse_unknown(algorithm: str, arguments: dict[str, Any]) -> None:
+    for name, value in arguments.items():
+        if name in NOT_OFFERED:
+            raise ValueError(f"{algorithm} cannot take {name}={value!r}: {NOT_OFFERED[name]}.")
+        raise TypeError(f"{algorithm} has no argument '{name}'.")
 
 
 def _draw(weights: th.Tensor, n: int) -> th.Tensor:

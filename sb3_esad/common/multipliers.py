@@ -1,5 +1,6 @@
 """What a violated cost limit costs the policy: an augmented Lagrangian, or nothing."""
 
+import math
 import warnings
 from abc import ABC, abstractmethod
 from typing import Any
@@ -8,10 +9,13 @@ import numpy as np
 import torch as th
 from torch import nn
 
+from sb3_esad.common.checks import require
 from sb3_esad.common.episode_record import EpisodeRecord
 from sb3_esad.common.functional import discounted_budget, tail_factor
 from sb3_esad.common.type_aliases import Logs
 
+ENOUGH_ROAD = 0.2
+"""How full the moving average of the cost rate must be before it has a say."""
 PATIENCE = 500
 """Updates at the upper bound after which the user is warned."""
 
@@ -73,6 +77,10 @@ class Penalty(nn.Module, ABC):
         """
 
     @abstractmethod
+    def forget_unfinished(self) -> None:
+        """Drop the episodes under way, for the environments have been reset."""
+
+    @abstractmethod
     def note_prediction(self, values: th.Tensor) -> None:
         """
         Take note of what the critic expects of whole episodes.
@@ -116,6 +124,9 @@ class NoPenalty(Penalty):
         return th.ones_like(risk, dtype=th.bool)
 
     def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        pass
+
+    def forget_unfinished(self) -> None:
         pass
 
     def note_prediction(self, values: th.Tensor) -> None:
@@ -172,14 +183,15 @@ class AugmentedLagrangian(Penalty):
     ) -> None:
         super().__init__()
         tail_factor(risk_level)  # refuses a level outside (0, 1]
-        _check(cost_limit >= 0, "cost_limit", cost_limit, "the cost allowed per episode, >= 0, or None for no limit")
-        _check(0 <= cost_gamma <= 1, "cost_gamma", cost_gamma, "a discount in [0, 1]")
-        _check(episode_length >= 1, "episode_length", episode_length, "a number of steps >= 1")
-        _check(barrier_coef >= 0, "barrier_coef", barrier_coef, "a weight >= 0")
-        _check(lambda_lr >= 0, "lambda_lr", lambda_lr, "a step >= 0")
-        _check(penalty_coef >= 0, "penalty_coef", penalty_coef, "a gain >= 0")
+        finite = 0 <= cost_limit < math.inf
+        require(finite, "cost_limit", cost_limit, "the cost allowed per episode, a number >= 0, or None for no limit")
+        require(0 <= cost_gamma <= 1, "cost_gamma", cost_gamma, "a discount in [0, 1]")
+        require(episode_length >= 1, "episode_length", episode_length, "a number of steps >= 1")
+        require(barrier_coef >= 0, "barrier_coef", barrier_coef, "a weight >= 0")
+        require(lambda_lr >= 0, "lambda_lr", lambda_lr, "a step >= 0")
+        require(penalty_coef >= 0, "penalty_coef", penalty_coef, "a gain >= 0")
         low, high = multiplier_bounds
-        _check(0 <= low <= multiplier_init <= high, "multiplier_init", multiplier_init, f"one within {low} and {high}")
+        require(0 <= low <= multiplier_init <= high, "multiplier_init", multiplier_init, f"one within {low} and {high}")
         self.cost_limit = cost_limit
         self.risk_level = risk_level
         self.cost_gamma = cost_gamma
@@ -240,6 +252,9 @@ class AugmentedLagrangian(Penalty):
     def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
         self.episodes.observe(costs, dones)
 
+    def forget_unfinished(self) -> None:
+        self.episodes.forget_unfinished()
+
     def note_prediction(self, values: th.Tensor) -> None:
         self.episodes.note_prediction(values)
 
@@ -258,7 +273,7 @@ class AugmentedLagrangian(Penalty):
         signals = {}
         if self.calibrated:
             signals["violation_model"] = violation / self.budget_scale
-        if self._enough_episodes:
+        if self.episodes.seen >= ENOUGH_ROAD:
             excess = self.episodes.tail_cost(self.risk_level) - self.cost_limit
             signals["violation_road"] = excess / max(self.cost_limit, 0.02)
         return {name: min(max(signal, -1.0), 1.0) for name, signal in signals.items()}
@@ -286,8 +301,3 @@ class AugmentedLagrangian(Penalty):
             "horizon": self.episodes.episode_length,
             **signals,
         }
-
-
-def _check(valid: bool, name: str, value: float, remedy: str) -> None:
-    if not valid:
-        raise ValueError(f"{name} is {value}; choose {remedy}.")

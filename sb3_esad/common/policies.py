@@ -7,10 +7,11 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.preprocessing import get_action_dim
-from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
+from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, get_actor_critic_arch
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_esad.common.actor import Actor
+from sb3_esad.common.checks import require
 from sb3_esad.common.critics import CostCritic, QEnsemble, make_target
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
@@ -29,12 +30,13 @@ class LatentPolicy(BasePolicy):
     :param observation_space: space of the observations
     :param action_space: box of the actions
     :param lr_schedule: learning rate of all networks
-    :param net_arch: hidden layers of actor, critics and heads
+    :param net_arch: hidden layers of actor and critics, or of each in a dictionary with ``pi`` and ``qf``; at least one
     :param memory_channels: channels of the memory in each cell; None for 48 on a grid and 256 for vectors
     :param latent_channels: channels of the stochastic latent in each cell; None for 8 on a grid and 32 for vectors
     :param world_model_kwargs: further arguments of the world model
     :param head_kwargs: further arguments of the latent head
-    :param features_extractor_class: encoder of the observations; its features become a grid if it has a ``grid_shape``
+    :param features_extractor_class: encoder of the observations, whose features become a grid if it has a ``grid_shape``;
+        None for the ``extractor_class`` of the policy
     :param features_extractor_kwargs: arguments of the encoder
     :param normalize_images: whether images are bytes to be divided by 255
     :param optimizer_class: optimiser of each network
@@ -42,23 +44,30 @@ class LatentPolicy(BasePolicy):
     """
 
     head_class: ClassVar[type[LatentHead]] = GaussianHead
+    extractor_class: ClassVar[type[BaseFeaturesExtractor]] = VectorExtractor
+    action_space: spaces.Box
 
     def __init__(
         self,
         observation_space: spaces.Space,
         action_space: spaces.Box,
         lr_schedule: Schedule,
-        net_arch: list[int] | None = None,
+        net_arch: list[int] | dict[str, list[int]] | None = None,
         memory_channels: int | None = None,
         latent_channels: int | None = None,
         world_model_kwargs: dict[str, Any] | None = None,
         head_kwargs: dict[str, Any] | None = None,
-        features_extractor_class: type[BaseFeaturesExtractor] = VectorExtractor,
+        features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
         optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
+        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
+            optimizer_kwargs = {"fused": True}
+        features_extractor_class = features_extractor_class or self.extractor_class
+        if not normalize_images and issubclass(features_extractor_class, SpatialCnn | CombinedExtractor):
+            features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}
         super().__init__(
             observation_space,
             action_space,
@@ -66,10 +75,13 @@ class LatentPolicy(BasePolicy):
             features_extractor_kwargs,
             normalize_images=normalize_images,
             optimizer_class=optimizer_class,
-            optimizer_kwargs={"fused": True} if optimizer_kwargs is None and optimizer_class is th.optim.Adam else optimizer_kwargs,
+            optimizer_kwargs=optimizer_kwargs,
             squash_output=True,
         )
-        self.net_arch = net_arch or [256, 256]
+        self.net_arch = [256, 256] if net_arch is None else net_arch
+        self.actor_arch, self.critic_arch = get_actor_critic_arch(self.net_arch)
+        complete = len(self.actor_arch) > 0 and len(self.critic_arch) > 0
+        require(complete, "net_arch", net_arch, "at least one hidden layer for the actor and for the critics")
         self.memory_channels = memory_channels
         self.latent_channels = latent_channels
         self.world_model_kwargs = world_model_kwargs or {}
@@ -80,24 +92,35 @@ class LatentPolicy(BasePolicy):
         self.world_model = self._make_world_model()
         rssm = self.world_model.rssm
         grid = (rssm.memory_shape[0] + rssm.latent_shape[0], *rssm.memory_shape[1:])
-        self.actor = Actor(grid, rssm.action_dim, self.net_arch)
-        self.critic = QEnsemble(grid, rssm.action_dim, self.net_arch)
-        self.cost_critic = CostCritic(grid, rssm.action_dim, self.net_arch)
+        self.actor = Actor(grid, rssm.action_dim, self.actor_arch)
+        self.critic = QEnsemble(grid, rssm.action_dim, self.critic_arch)
+        self.cost_critic = CostCritic(grid, rssm.action_dim, self.critic_arch)
         self.critic_target, self.cost_critic_target = make_target(self.critic), make_target(self.cost_critic)
-        self.to(memory_format=th.channels_last)
+        self.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # torch's stub does not know the keyword
         for network in (self.world_model, self.actor, self.critic, self.cost_critic):
-            network.optimizer = self.optimizer_class(network.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs)
+            network.optimizer = self.optimizer_class(
+                network.parameters(),
+                lr=lr_schedule(1),  # type: ignore[call-arg]
+                **self.optimizer_kwargs,
+            )
 
     def _make_world_model(self) -> WorldModel:
         extractor = self.make_features_extractor()
-        embedding_channels, *cells = grid_shape(extractor)
-        spatial = cells != [1, 1]
-        memory_shape = (self.memory_channels or (48 if spatial else 256), *cells)
+        embedding_channels, height, width = grid_shape(extractor)
+        spatial = height * width > 1
+        memory_shape = (self.memory_channels or (48 if spatial else 256), height, width)
         latent_channels = self.latent_channels or (8 if spatial else 32)
-        head = self.head_class(memory_shape, embedding_channels, latent_channels, hidden_channels=memory_shape[0], **self.head_kwargs)
+        head = self.head_class(
+            memory_shape, embedding_channels, latent_channels, hidden_channels=memory_shape[0], **self.head_kwargs
+        )
         rssm = RSSM(memory_shape, latent_channels, get_action_dim(self.action_space), head)
         return WorldModel(
-            self.observation_space, extractor, rssm, normalize_images=self.normalize_images, units=self.net_arch[0], **self.world_model_kwargs
+            self.observation_space,
+            extractor,
+            rssm,
+            normalize_images=self.normalize_images,
+            units=self.critic_arch[0],
+            **self.world_model_kwargs,
         )
 
     def initial_state(self, n_envs: int) -> LatentState:
@@ -110,7 +133,9 @@ class LatentPolicy(BasePolicy):
         return self.world_model.initial(n_envs)
 
     @th.no_grad()
-    def filter(self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> LatentState:
+    def filter(
+        self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool
+    ) -> LatentState:
         """
         Take in an observation, forgetting the past where an episode starts.
 
@@ -185,21 +210,19 @@ class LatentPolicy(BasePolicy):
         initial = self.initial_state(n_envs)
         if state is None:
             return initial
-        if state[0].shape[1] != n_envs:
-            raise ValueError(
-                f"predict() was given {n_envs} observation(s) but a state for {state[0].shape[1]} environment(s): "
-                "pass the state that the last call returned for these environments, or None to start afresh."
-            )
+        shapes = [tuple(np.shape(array)) for array in state]
+        expected = [(1, n_envs, field[0].numel()) for field in initial]
+        if shapes != expected:
+            remedy = "pass what the last call returned for these environments, or None to start afresh"
+            raise ValueError(f"predict() was given {n_envs} observation(s) with a state of shapes {shapes}: {remedy}.")
         fields = (th.as_tensor(array[0], device=self.device) for array in state)
         return LatentState(*(field.view_as(zeros) for field, zeros in zip(fields, initial, strict=True)))
 
     @staticmethod
     def _refuse_gym_reset(observation: Any) -> None:
         if isinstance(observation, tuple):
-            raise ValueError(
-                "predict() was given a tuple, as Gym's reset() returns it (you are mixing Gym API with SB3 VecEnv API): "
-                "pass the observation alone."
-            )
+            hint = "that is what Gym's reset() returns (you are mixing Gym API with SB3 VecEnv API)"
+            raise ValueError(f"predict() was given a tuple, {hint}: pass the observation alone.")
 
     def _get_constructor_parameters(self) -> dict[str, Any]:
         return {
@@ -220,12 +243,10 @@ class LatentPolicy(BasePolicy):
 class LatentCnnPolicy(LatentPolicy):
     """:class:`LatentPolicy` for images; the memory keeps the picture's geometry."""
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = SpatialCnn, **kwargs: Any) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    extractor_class = SpatialCnn
 
 
 class LatentMultiInputPolicy(LatentPolicy):
     """:class:`LatentPolicy` for dictionaries of images and vectors."""
 
-    def __init__(self, *args: Any, features_extractor_class: type[BaseFeaturesExtractor] = CombinedExtractor, **kwargs: Any) -> None:
-        super().__init__(*args, features_extractor_class=features_extractor_class, **kwargs)
+    extractor_class = CombinedExtractor

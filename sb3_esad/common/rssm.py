@@ -1,6 +1,6 @@
 """Recurrent state-space model: how the latent state moves on with an action, with and without an observation."""
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import torch as th
 from torch import nn
@@ -8,6 +8,8 @@ from torch import nn
 from sb3_esad.common.latents import Gaussian, LatentHead
 from sb3_esad.common.torch_layers import ChannelNorm, GridShape, join, kernel_size, same_conv
 from sb3_esad.common.type_aliases import LatentState
+
+Record = TypeVar("Record", LatentState, Gaussian)
 
 
 class GridGRU(nn.Module):
@@ -73,16 +75,21 @@ class Filtered(NamedTuple):
         states, before = (state.map(th.Tensor.detach) for state in (self.states, self.before))
         return Filtered(states, before, self.posterior.detach(), self.prior.detach(), self.is_first, self.hidden)
 
-    def settled(self, steps: int) -> th.Tensor:
+    def settled(self, steps: int, episode_starts: th.Tensor) -> th.Tensor:
         """
-        Tell the states that have seen enough to be trusted.
+        Tell the states before actions that know as much as they would when acting.
 
-        :param steps: steps since the model started afresh; a state whose own observation was withheld is not trusted
+        Where an episode starts all of them do, within an episode only those some steps after the start of the window. A
+        state whose own observation was withheld does not.
+
+        :param steps: steps since the window started
+        :param episode_starts: whether the step really opens an episode, of shape (T, B)
         :return: bool, of shape (T, B)
         """
         index = th.arange(len(self.is_first), device=self.is_first.device)[:, None]
         fresh = th.where(self.is_first, index, 0).cummax(0).values
-        return (index - fresh >= steps - 1) & ~self.hidden
+        blind = self.hidden.roll(1, 0) & ~self.is_first
+        return ((index - fresh >= steps) | episode_starts.gather(0, fresh)) & ~blind
 
 
 class RSSM(nn.Module):
@@ -149,7 +156,9 @@ class RSSM(nn.Module):
         posterior = self.head.posterior(memory, embedding)
         return LatentState(memory, posterior.mean if deterministic else posterior.sample(), th.zeros_like(state.action))
 
-    def scan(self, first: LatentState, is_first: th.Tensor, actions: th.Tensor, embeddings: th.Tensor, hidden: th.Tensor) -> Filtered:
+    def scan(
+        self, first: LatentState, is_first: th.Tensor, actions: th.Tensor, embeddings: th.Tensor, hidden: th.Tensor
+    ) -> Filtered:
         """
         Filter whole windows.
 
@@ -174,11 +183,13 @@ class RSSM(nn.Module):
             blind = hidden[t, :, None, None, None]
             latent = Gaussian(*(th.where(blind, p, q) for p, q in zip(prior, posterior, strict=True))).sample()
             state = LatentState(memory, latent, th.zeros_like(action))
-            states.append(state), posteriors.append(posterior), priors.append(prior)
+            states.append(state)
+            posteriors.append(posterior)
+            priors.append(prior)
         return Filtered(_stack(states), _stack(befores), _stack(posteriors), _stack(priors), is_first, hidden)
 
 
-def _stack(items):  # type: ignore[no-untyped-def]
+def _stack(items: list[Record]) -> Record:
     return type(items[0])(*(join(fields) for fields in zip(*items, strict=True)))
 
 

@@ -14,13 +14,13 @@ Target = str | pathlib.Path | io.BufferedIOBase
 
 
 @contextmanager
-def whole_file(path: Target, suffix: str = "") -> Iterator[Target]:
+def whole_file(path: Target, suffix: str = "") -> Iterator[Any]:
     """
     Write to a temporary file beside the wanted one, which it replaces once it is complete.
 
     :param path: where the file shall be, its folder is made; a file-like object is handed on as it is
     :param suffix: added to a path that has none, as SB3 does, with its dot
-    :return: what to write to; its suffix is that of the wanted file
+    :return: the ``Path`` to write to, whose suffix is that of the wanted file, or the file-like object
     """
     if not isinstance(path, str | pathlib.Path):
         yield path
@@ -62,36 +62,32 @@ def check_saved_model(path: Target, algorithm: str, mark: str) -> None:
         return
     found = next((each for each in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if each.is_file()), None)
     if found is None:
-        raise ValueError(f"There is no file {path}: give the zip that {algorithm}.save() or the training has written.")
+        raise ValueError(f"There is no file {path}: give the zip that {algorithm}.save() has written.")
     with found.open("rb") as file:
         _check_archive(file, str(found), algorithm, mark)
 
 
 def _check_archive(file: Any, name: str, algorithm: str, mark: str) -> None:
-    starts_like_zip = file.read(2) == b"PK"
+    remedy = f"give the zip that {algorithm}.save() has written."
+    if file.read(2) != b"PK":
+        raise ValueError(f"{name} is no zip file: {remedy}")
     file.seek(0)
-    if not starts_like_zip:
-        raise ValueError(f"{name} is no zip file: give the zip that {algorithm}.save() has written.")
     try:
         with zipfile.ZipFile(file) as archive:
             damaged = archive.testzip()
-            members = archive.namelist()
-            data = json.loads(archive.read("data")) if damaged is None and "data" in members else {}
+            complete = {"data", "policy.pth"} <= set(archive.namelist())
+            data = json.loads(archive.read("data")) if damaged is None and complete else {}
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError, ValueError) as error:
         raise ValueError(f"{name} is cut off or damaged ({error}): save or copy it again.") from error
     if damaged is not None:
         raise ValueError(f"{name} is damaged at its member '{damaged}': save or copy it again.")
-    if "data" not in members or "policy.pth" not in members:
-        raise ValueError(
-            f"{name} is a zip but holds no model of Stable-Baselines3: give the zip that {algorithm}.save() has written."
-        )
+    if not complete:
+        raise ValueError(f"{name} holds no model of Stable-Baselines3, or only a part of one: {remedy}")
     if mark not in data:
-        raise ValueError(
-            f"{name} holds no {algorithm} but a model with {_policy_of(data)}: load it with the class that saved it."
-        )
+        raise ValueError(f"{name} holds no {algorithm} but {_describe(data)}: load it with the class that saved it.")
 
 
-def _policy_of(data: dict[str, Any]) -> str:
-    """Name of the policy's module as SB3 notes it in plain text, for a message."""
-    entry = data.get("policy_class")
-    return f"a policy of {entry['__module__']}" if isinstance(entry, dict) and "__module__" in entry else "an unknown policy"
+def _describe(data: Any) -> str:
+    """Name the model by the module of its policy, which SB3 notes in plain text."""
+    policy = data.get("policy_class") if isinstance(data, dict) else None
+    return f"a model with a policy of {policy.get('__module__')}" if isinstance(policy, dict) else "another model"

@@ -1,6 +1,5 @@
-"""Building blocks shared by the world model and the behaviour networks: everything is a grid of cells, a vector is a grid of one cell."""
+"""Building blocks of all networks: everything is a grid of cells, a vector is a grid of one cell."""
 
-import math
 from collections.abc import Sequence
 
 import torch as th
@@ -8,6 +7,12 @@ from torch import nn
 
 GridShape = tuple[int, int, int]
 """Channels, height and width of a grid of features."""
+
+
+class LearningModule(nn.Module):
+    """A network with an optimiser of its own."""
+
+    optimizer: th.optim.Optimizer
 
 
 class ChannelNorm(nn.LayerNorm):

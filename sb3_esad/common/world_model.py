@@ -1,6 +1,7 @@
 """The world model: a recurrent state-space model with heads for observation, reward, cost and continuation."""
 
-from collections.abc import Callable
+from collections.abc import Callable, ItemsView
+from typing import Any, cast
 
 import torch as th
 from gymnasium import spaces
@@ -9,18 +10,18 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
+from sb3_esad.common.decoders import ImageHead, ObservationHead, VectorHead
 from sb3_esad.common.extractors import grid_shape
-from sb3_esad.common.decoders import ImageHead, VectorHead
 from sb3_esad.common.heads import PredictionHeads
 from sb3_esad.common.precision import working_dtype
 from sb3_esad.common.rssm import RSSM, Filtered
-from sb3_esad.common.torch_layers import join
+from sb3_esad.common.torch_layers import GridShape, LearningModule, join
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, Predictions, SequenceSamples
 
 Observations = th.Tensor | TensorDict
 
 
-class WorldModel(nn.Module):
+class WorldModel(LearningModule):
     """
     Latent world model.
 
@@ -56,13 +57,23 @@ class WorldModel(nn.Module):
         grid = (channels, *rssm.memory_shape[1:])
         self.predictions = PredictionHeads(grid, units, cost_weight)
         self.observations = nn.ModuleDict(
-            {
-                key: ImageHead(grid, space.shape, foreground_weight)
-                if is_image_space(space, normalized_image=not normalize_images)
-                else VectorHead(grid, get_flattened_obs_dim(space))
-                for key, space in _by_key(observation_space).items()
-            }
+            {key: self._make_head(space, grid, foreground_weight) for key, space in _spaces_by_key(observation_space).items()}
         )
+
+    def _make_head(self, space: spaces.Space, grid: GridShape, foreground_weight: float) -> ObservationHead:
+        if is_image_space(space, normalized_image=not self.normalize_images):
+            assert space.shape is not None
+            return ImageHead(grid, space.shape, foreground_weight)
+        return VectorHead(grid, get_flattened_obs_dim(space))
+
+    def images(self, observations: dict[str, Any] | Any) -> dict[str, Any]:
+        """
+        Pick out what is shown as an image.
+
+        :param observations: one observation of any type, or one for each key of a Dict space
+        :return: the images by key, the key of a single observation is "observation"
+        """
+        return {key: _by_key(observations)[key] for key, head in self._observation_heads() if isinstance(head, ImageHead)}
 
     def initial(self, n: int) -> LatentState:
         """
@@ -111,9 +122,7 @@ class WorldModel(nn.Module):
         return self.rssm.scan(first, is_first, actions, embeddings.unflatten(0, actions.shape[:2]), hidden)
 
     @th.no_grad()
-    def imagine(
-        self, start: LatentState, policy: Callable[[th.Tensor], th.Tensor], horizon: int, gamma: float
-    ) -> Imagination:
+    def imagine(self, start: LatentState, policy: Callable[[th.Tensor], th.Tensor], horizon: int, gamma: float) -> Imagination:
         """
         Roll the policy out in the latent space.
 
@@ -159,7 +168,7 @@ class WorldModel(nn.Module):
         :param states: N states
         :return: preprocessed observations by key, of shape (N, ...); the key of a single observation is "observation"
         """
-        return {key: head(self.features(states)) for key, head in self.observations.items()}
+        return {key: head(self.features(states)) for key, head in self._observation_heads()}
 
     def loss(self, samples: SequenceSamples) -> tuple[th.Tensor, Filtered, Logs]:
         """
@@ -178,7 +187,7 @@ class WorldModel(nn.Module):
         # Decoding is the dearest part, and half of the frames say as much about the other half
         some = th.randperm(len(grid), device=grid.device)[: (len(grid) + 1) // 2]
         seen = self._preprocess(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)[some]))
-        observation_losses = [head.loss(grid[some], _by_key(seen)[key]) for key, head in self.observations.items()]
+        observation_losses = [head.loss(grid[some], _by_key(seen)[key]) for key, head in self._observation_heads()]
         observation_loss = th.stack(observation_losses).sum()
         loss = observation_loss + prediction_loss + kl_loss
         return loss, filtered, {**logs, **kl_logs, "observation_loss": observation_loss.item()}
@@ -191,16 +200,21 @@ class WorldModel(nn.Module):
         stretch = th.randint(1, self.open_loop_length + 1, (n,), device=steps.device)
         return (index >= start) & (index < start + stretch) & (th.rand(n, device=steps.device) < 0.5)
 
+    def _observation_heads(self) -> ItemsView[str, ObservationHead]:
+        return cast(ItemsView[str, ObservationHead], self.observations.items())
+
     def _preprocess(self, observations: Observations) -> Observations:
         # Images are as exact in bfloat16 as they were as bytes, and half as large
         preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
         return _map(preprocessed, lambda x: x.to(working_dtype(x.device)) if x.dim() == 4 else x)
 
 
-def _by_key(value):  # type: ignore[no-untyped-def]
-    if isinstance(value, spaces.Dict):
-        return value.spaces
-    return value if isinstance(value, dict) else {"observation": value}
+def _by_key(observations: Observations) -> TensorDict:
+    return observations if isinstance(observations, dict) else {"observation": observations}
+
+
+def _spaces_by_key(space: spaces.Space) -> dict[str, spaces.Space]:
+    return space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
 
 
 def _map(observations: Observations, function: Callable[[th.Tensor], th.Tensor]) -> Observations:

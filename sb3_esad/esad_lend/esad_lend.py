@@ -11,8 +11,9 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
 from stable_baselines3.common.utils import polyak_update
 
 from sb3_esad.common.callbacks import LagrangeCallback, prepend
+from sb3_esad.common.checks import require
 from sb3_esad.common.entropy import make_entropy_coefficient
-from sb3_esad.common.functional import barrier_residual, capped_cvar
+from sb3_esad.common.functional import barrier_residual, capped_cvar, tail_factor
 from sb3_esad.common.latent_algorithm import LatentAlgorithm
 from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty, Penalty
 from sb3_esad.common.policies import LatentPolicy
@@ -78,7 +79,7 @@ class ESADLEND(LatentAlgorithm):
         ent_coef: str | float = "auto_0.1",
         target_entropy: str | float = "auto",
         lagrangian_multiplier_init: float = 1.0,
-        lambda_lr: float = 0.01,
+        lambda_lr: float = 0.003,
         lagrangian_upper_bound: float = 50.0,
         penalty_coef: float = 1.0,
         penalty_warmup: int = 1000,
@@ -110,6 +111,15 @@ class ESADLEND(LatentAlgorithm):
         self.uniform_action_prob = uniform_action_prob
         if _init_setup_model:
             self._setup_model()
+
+    def _check_arguments(self) -> None:
+        super()._check_arguments()
+        tail_factor(self.risk_level)  # refuses a level outside (0, 1], with and without a limit
+        require(0 <= self._cost_gamma < 1, "cost_gamma", self._cost_gamma, "a discount in [0, 1), also where it is gamma")
+        require(0 < self.barrier_decay <= 1, "barrier_decay", self.barrier_decay, "a rate in (0, 1]")
+        require(self.barrier_steps >= 1, "barrier_steps", self.barrier_steps, "a number of steps >= 1")
+        uniform = self.uniform_action_prob
+        require(0 <= uniform <= 1, "uniform_action_prob", uniform, "a probability in [0, 1]")
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -149,7 +159,7 @@ class ESADLEND(LatentAlgorithm):
         """
         Hand over how far the expected risk exceeded the budget since the last call.
 
-        :return: mean of Gamma - d over replayed states, None if there was no update since
+        :return: mean of Gamma - d over the states visited, None if there were none or the critics have not been updated yet
         """
         violations, self._violations = self._violations, []
         return th.stack(violations).mean() if violations else None
@@ -159,18 +169,22 @@ class ESADLEND(LatentAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         starts = self._last_episode_starts
         sampled = super()._sample_action(learning_starts, action_noise, n_envs)
-        if self._n_updates > 0 and starts is not None and starts.any():
-            self._note_prediction(starts)
+        if self._n_updates > 0:
+            self._note_risk(np.zeros(n_envs, dtype=bool) if starts is None else starts)
         return sampled
 
     @th.no_grad()
-    def _note_prediction(self, starts: np.ndarray) -> None:
-        """Tell the penalty what the critics expect of the episodes that start now."""
+    def _note_risk(self, starts: np.ndarray) -> None:
+        """
+        Note what the critics expect where the policy really is: replayed states are those of policies that are gone.
+
+        :param starts: which environments have just begun an episode, of shape (n_envs,)
+        """
         assert self._last_latent is not None
-        begun = th.as_tensor(starts, device=self.device)
-        begun_states = self._last_latent.map(lambda field: field[begun])
-        means, _ = self.policy.cost_critic(self.policy.world_model.features(begun_states), begun_states.action)
-        self.penalty.note_prediction(means.mean(0))
+        grids, actions = self.policy.world_model.features(self._last_latent), self._last_latent.action
+        self._violations.append(self.risk(grids, actions).mean() - self.penalty.budget)
+        means, _ = self.policy.cost_critic(grids, actions)
+        self.penalty.note_prediction(means.mean(0)[th.as_tensor(starts, device=self.device).bool()])
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
         # The critics must know what actions lead to that the policy would never take
@@ -236,7 +250,6 @@ class ESADLEND(LatentAlgorithm):
         loss = (imagined.weights.flatten() * self.penalty.combine(objective, risk, barrier.flatten())).mean()
         self._step(self.policy.actor, loss)
         usual_risk = risk.detach()[: self.imagination_starts // 2].mean()
-        self._violations.append(usual_risk - self.penalty.budget)
         return {
             "actor_loss": loss.item(),
             "cvar": usual_risk.item(),
@@ -264,10 +277,13 @@ class ESADLEND(LatentAlgorithm):
         residual[:-steps] = barrier_residual(risk[steps:], risk[:-steps], self.penalty.budget, self.barrier_decay)
         return residual
 
+    def _optimizers(self) -> dict[str, th.optim.Optimizer]:
+        own = {f"entropy.{name}": getattr(self.entropy, name) for name in self.entropy.optimizer_names}
+        return {**super()._optimizers(), **own}
+
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
-        optimizers = (f"entropy.{name}" for name in self.entropy.optimizer_names)
-        return [*names, "penalty", "entropy", *optimizers], variables
+        return [*names, "penalty", "entropy"], variables
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "penalty", "entropy", "_violations"]

@@ -1,0 +1,136 @@
+"""The command line: ``python -m sb3_esad evaluate | demo``."""
+
+import argparse
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+import gymnasium
+import torch as th
+from stable_baselines3.common.utils import set_random_seed
+
+from sb3_esad import ESADLEND, __version__
+from sb3_esad.demo import ENV_ID, run_demo
+from sb3_esad.driving_evaluation import DRIVERS, evaluate_driver, evaluate_model
+from sb3_esad.report import format_table, summarise_any, write_json
+from sb3_esad.video import record_driver, record_model
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """
+    Run a command.
+
+    :param arguments: words of the command line, None for those of the process
+    :return: exit code, 2 if the user must change something
+    """
+    args = make_parser().parse_args(arguments)
+    try:
+        args.run(args)
+    except (ValueError, ImportError, OSError, gymnasium.error.Error) as error:
+        print(f"sb3_esad {args.command}: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def make_parser() -> argparse.ArgumentParser:
+    """
+    Describe the commands; each sets ``run`` to the function that carries it out.
+
+    :return: the parser
+    """
+    parser = argparse.ArgumentParser(
+        prog="python -m sb3_esad", description="Safe model-based reinforcement learning for driving."
+    )
+    parser.add_argument("--version", action="version", version=f"sb3_esad {__version__}")
+    commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
+    _add_evaluate(commands.add_parser("evaluate", help="drive episodes with a model or a scripted driver, print the metrics"))
+    _add_demo(commands.add_parser("demo", help="train briefly, evaluate, write model, learning curve, results and video"))
+    return parser
+
+
+def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_evaluate)
+    who = parser.add_mutually_exclusive_group(required=True)
+    who.add_argument("--model", type=Path, metavar="FILE.zip", help="saved ESADLEND model")
+    who.add_argument("--driver", choices=DRIVERS, help="scripted driver")
+    parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
+    parser.add_argument("--episodes", type=_positive, default=100, metavar="N", help="how many (default: %(default)s)")
+    parser.add_argument(
+        "--seed", type=_not_negative, default=0, metavar="S", help="episode i uses seed S + i (default: %(default)s)"
+    )
+    parser.add_argument("--stochastic", action="store_true", help="sample the model's actions")
+    parser.add_argument("--video", type=Path, metavar="FILE.mp4", help="film the first episode")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="write figures and episode records")
+
+
+def _evaluate(args: argparse.Namespace) -> None:
+    seeds = range(args.seed, args.seed + args.episodes)
+    if args.driver:
+        name, how = args.driver, "scripted"
+        if args.video:
+            record_driver(args.video, args.driver, args.env, args.seed)
+        records = evaluate_driver(args.driver, args.env, seeds)
+    else:
+        name, how = args.model.name, "stochastic" if args.stochastic else "deterministic"
+        model = ESADLEND.load(args.model)
+        set_random_seed(args.seed)
+        if args.video:
+            record_model(args.video, model, args.env, args.seed, not args.stochastic)
+        records = evaluate_model(model, args.env, seeds, not args.stochastic)
+    figures = summarise_any(records)
+    print(
+        f"{args.env}, {args.episodes} episodes with the seeds {seeds[0]} to {seeds[-1]}, {how}; in brackets 95 % intervals\n"
+    )
+    print(format_table({name: figures}))
+    if args.json:
+        about = {"env": args.env, "driver": name, "how": how, "sb3_esad": __version__}
+        write_json(args.json, {**about, "figures": figures, "records": records})
+
+
+def _add_demo(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_demo)
+    parser.add_argument(
+        "--out", type=Path, default=Path("demo"), metavar="FOLDER", help="where to write (default: %(default)s)"
+    )
+    parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the training (default: %(default)s)")
+    parser.add_argument("--timesteps", type=_positive, metavar="N", help="environment steps at most")
+    parser.add_argument(
+        "--minutes", type=_above_zero, default=6.0, metavar="M", help="of training at most (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--episodes", type=_positive, default=100, metavar="N", help="of the evaluation (default: %(default)s)"
+    )
+    parser.add_argument("--threads", type=_positive, default=2, metavar="N", help="of the processor (default: %(default)s)")
+
+
+def _demo(args: argparse.Namespace) -> None:
+    th.set_num_threads(args.threads)
+    run_demo(args.out, args.seed, args.timesteps, args.minutes, args.episodes)
+
+
+def _positive(text: str) -> int:
+    return _at_least(1, text)
+
+
+def _not_negative(text: str) -> int:
+    return _at_least(0, text)
+
+
+def _at_least(least: int, text: str) -> int:
+    if not text.lstrip("+-").isdecimal() or int(text) < least:
+        raise argparse.ArgumentTypeError(f"'{text}' is no whole number from {least} on")
+    return int(text)
+
+
+def _above_zero(text: str) -> float:
+    try:
+        number = float(text)
+    except ValueError:
+        number = 0.0
+    if not 0 < number < float("inf"):
+        raise argparse.ArgumentTypeError(f"'{text}' is no number above 0")
+    return number
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,104 @@
+"""The main job in a few minutes: learn to drive from images, and prove it on episodes that were never seen."""
+
+import os
+import platform
+import time
+from collections.abc import Mapping
+from importlib.metadata import version
+from pathlib import Path
+
+import torch as th
+from stable_baselines3.common.env_util import make_vec_env
+
+from sb3_esad.common.save_util import whole_file
+from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
+from sb3_esad.esad_lend import ESADLEND
+from sb3_esad.hyperparams import load_hyperparams
+from sb3_esad.plots import plot_learning_curve
+from sb3_esad.progress import EpisodeHistory, EpisodeProgressBar, StopAfter
+from sb3_esad.report import Figures, format_table, summarise_any
+from sb3_esad.video import record_model
+
+ENV_ID = "esad-highway-v0"
+UNSEEN = 1_000_000
+"""First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
+
+
+def run_demo(folder: Path, seed: int = 0, timesteps: int | None = None, minutes: float = 6.0, episodes: int = 100) -> None:
+    """
+    Train, evaluate beside two simple drivers, and write model, learning curve, results and video into a folder.
+
+    :param folder: where to write
+    :param seed: of the training
+    :param timesteps: environment steps at most, None for those of the hyperparameters
+    :param minutes: of training at most
+    :param episodes: of the evaluation
+    :raises ValueError: if the training was too short for a single episode
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    model, training = train(folder, seed, timesteps, minutes)
+    seeds = range(UNSEEN, UNSEEN + episodes)
+    print(f"Evaluating on {episodes} unseen episodes ...", flush=True)
+    columns = {
+        "ESAD-LEND": summarise_any(evaluate_model(model, ENV_ID, seeds)),
+        "holds speed and lane": summarise_any(evaluate_driver("keeper", ENV_ID, seeds)),
+        "random": summarise_any(evaluate_driver("random", ENV_ID, seeds)),
+    }
+    write_results(folder / "results.md", columns, training, seeds)
+    record_model(folder / "episode.mp4", model, ENV_ID, seeds[0])
+    print(f"\n{format_table(columns)}\n\nIn brackets: 95 % intervals. Written:")
+    for name in ("results.md", "learning_curve.png", "episode.mp4", "esad_lend.zip"):
+        print(f"  {folder / name}")
+
+
+def train(folder: Path, seed: int, timesteps: int | None, minutes: float) -> tuple[ESADLEND, str]:
+    """
+    Train until the steps are done or the time is over; write the model and its learning curve.
+
+    :param folder: where to write
+    :param seed: of the training
+    :param timesteps: environment steps at most, None for those of the hyperparameters
+    :param minutes: at most
+    :return: the model, and a sentence about its training
+    """
+    hyperparams = load_hyperparams(ESADLEND, "esad_lend", ENV_ID)
+    steps = hyperparams.n_timesteps if timesteps is None else timesteps
+    model = ESADLEND(env=make_vec_env(ENV_ID, hyperparams.n_envs), seed=seed, **hyperparams.arguments)
+    history = EpisodeHistory()
+    print(f"Training ESAD-LEND on {ENV_ID} for {steps} steps or {minutes:g} minutes ...", flush=True)
+    start = time.monotonic()
+    model.learn(steps, callback=[history, EpisodeProgressBar(history), StopAfter(minutes)])
+    took = (time.monotonic() - start) / 60
+    model.save(folder / "esad_lend.zip")
+    plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)
+    done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
+    return (
+        model,
+        f"Trained for {done} in {took:.1f} minutes with seed {seed}, at most {model.cost_limit} cost per episode wanted.",
+    )
+
+
+def write_results(path: Path, columns: Mapping[str, Figures], training: str, seeds: range) -> None:
+    """
+    Write the table, and all that is needed to get it again.
+
+    :param path: where to
+    :param columns: figures by the name of the driver
+    :param training: a sentence about it
+    :param seeds: of the evaluation
+    """
+    versions = ", ".join(f"{name} {version(name)}" for name in ("stable_baselines3", "torch", "gymnasium", "numpy"))
+    lines = [
+        f"# ESAD-LEND on {ENV_ID}",
+        "",
+        training,
+        f"Evaluated on {len(seeds)} episodes with the seeds {seeds[0]} to {seeds[-1]}, by the best action, not a sampled one.",
+        "",
+        format_table(columns),
+        "",
+        "In brackets: 95 % intervals, Wilson's for shares and Student's t for means.",
+        "",
+        f"Python {platform.python_version()}, {versions}; {os.cpu_count()} processors, {th.get_num_threads()} threads.",
+    ]
+    with whole_file(path) as target:
+        target.write_text("\n".join(lines) + "\n", encoding="utf-8")

@@ -1,0 +1,175 @@
+"""Evaluation on chosen seeds: every episode is driven once and to its end, whoever drives."""
+
+from collections import deque
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+from numpy.typing import NDArray
+from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_esad.common.costs import CostReader
+from sb3_esad.envs.drivers import CarFollower, RandomDriver, ReferenceDriver, SpeedKeeper
+from sb3_esad.envs.metrics import Record
+from sb3_esad.envs.scenario import Scenario
+
+Driver = Callable[[gym.Env[Any, Any]], NDArray[np.float32]]
+
+DRIVERS: dict[str, Callable[[int], Driver]] = {
+    "reference": lambda seed: ReferenceDriver(),
+    "follower": lambda seed: CarFollower(),
+    "keeper": lambda seed: SpeedKeeper(),
+    "random": RandomDriver,
+}
+"""Makes a scripted driver for the episode of a seed."""
+
+
+class SeededEpisodes(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    Plays one episode for each seed, notes what came of it in ``records``, and then stands still.
+
+    A record holds ``seed``, ``return``, ``cost`` and ``steps``, and all of ``info["driving"]`` if there is such a thing.
+
+    :param env: environment
+    :param seeds: of the episodes, in their order
+    :param cost_key: key of the cost in the info dict
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], seeds: Sequence[int], cost_key: str = "cost") -> None:
+        super().__init__(env)
+        self.records: list[Record] = []
+        self.seed = 0
+        self._running = False
+        self._waiting = deque(seeds)
+        self._read_costs = CostReader(cost_key)
+        self._at_reset: tuple[Any, dict[str, Any]] = (None, {})
+
+    @property
+    def finished(self) -> bool:
+        """Whether all episodes are over."""
+        return not self._running and not self._waiting
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        """
+        Start the next episode.
+
+        :param seed: ignored
+        :param options: passed on
+        :return: its first observation and info; the previous ones again if there is none left
+        """
+        self._running = bool(self._waiting)
+        if self._running:
+            self.seed = self._waiting.popleft()
+            self._sums = {"return": 0.0, "cost": 0.0, "steps": 0.0}
+            self._at_reset = self.env.reset(seed=self.seed, options=options)
+        return self._at_reset
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """
+        Step the environment, or stand still if all episodes are over.
+
+        :param action: passed on
+        :return: what the environment returns
+        """
+        if not self._running:
+            return self._at_reset[0], 0.0, False, False, {}
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        self._sums["return"] += float(reward)
+        self._sums["cost"] += float(self._read_costs([info])[0])
+        self._sums["steps"] += 1
+        if terminated or truncated:
+            self.records.append({"seed": self.seed, **self._sums, **info.get("driving", {})})
+            self._running = False
+        return observation, reward, terminated, truncated, info
+
+
+def evaluate_model(
+    model: BaseAlgorithm, env_id: str, seeds: Sequence[int], deterministic: bool = True, n_envs: int = 20
+) -> list[Record]:
+    """
+    Let a model drive several environments side by side.
+
+    Environment k plays every ``n_envs``-th seed from the k-th on; that short episodes end first makes no difference.
+
+    :param model: recurrent or not
+    :param env_id: environment
+    :param seeds: of the episodes
+    :param deterministic: take the best action, not a sampled one
+    :param n_envs: number of environments, at most one for each seed
+    :return: one record for each seed, in their order
+    :raises ValueError: if there are no seeds, or if the model was trained on other observations or actions
+    """
+    if not seeds:
+        raise ValueError("There are no seeds to evaluate; give at least one.")
+    n_envs = min(n_envs, len(seeds))
+    cost_key = getattr(model, "cost_key", "cost")
+    dummy_env = DummyVecEnv([partial(_make, env_id, seeds[first::n_envs], cost_key) for first in range(n_envs)])
+    envs: list[Any] = dummy_env.envs
+    vec_env = BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False)
+    check_spaces(model, vec_env, env_id)
+    observations, state, starts = vec_env.reset(), None, np.ones(n_envs, dtype=bool)
+    while not all(env.finished for env in envs):
+        actions, state = model.predict(observations, state, starts, deterministic)  # type: ignore[arg-type]
+        observations, _, starts, _ = vec_env.step(actions)
+    vec_env.close()
+    return [envs[index % n_envs].records[index // n_envs] for index in range(len(seeds))]
+
+
+def evaluate_driver(name: str, env_id: str, seeds: Sequence[int]) -> list[Record]:
+    """
+    Let a scripted driver drive.
+
+    :param name: key of ``DRIVERS``
+    :param env_id: driving scenario
+    :param seeds: of the episodes
+    :return: one record for each seed, in their order
+    :raises ValueError: if the environment is no driving scenario
+    """
+    env = _make(env_id, seeds)
+    check_scenario(env, env_id)
+    while not env.finished:
+        env.reset()
+        driver, done = DRIVERS[name](env.seed), False
+        while not done:
+            _, _, terminated, truncated, _ = env.step(driver(env))
+            done = terminated or truncated
+    env.close()
+    return env.records
+
+
+def check_scenario(env: gym.Env[Any, Any], env_id: str) -> None:
+    """
+    Refuse an environment that scripted drivers do not know their way about in.
+
+    :param env: environment, wrapped or not
+    :param env_id: its name
+    :raises ValueError: if it is no driving scenario
+    """
+    if not isinstance(env.unwrapped, Scenario):
+        raise ValueError(f"{env_id} is no driving scenario; scripted drivers and videos need an id that starts with esad-.")
+
+
+def check_spaces(model: BaseAlgorithm, env: VecEnv | gym.Env[Any, Any], env_id: str) -> None:
+    """
+    Refuse an environment whose observations or actions the model does not know.
+
+    :param model: trained model
+    :param env: environment or environments, images channel-first
+    :param env_id: its name
+    :raises ValueError: if the spaces differ
+    """
+    for kind, known, found in (
+        ("Observations", model.observation_space, env.observation_space),
+        ("Actions", model.action_space, env.action_space),
+    ):
+        if known != found:
+            raise ValueError(
+                f"{kind} of {env_id} are {found}, but the model was trained on {known}; give the id that it knows."
+            )
+
+
+def _make(env_id: str, seeds: Sequence[int], cost_key: str = "cost") -> SeededEpisodes:
+    return SeededEpisodes(gym.make(env_id), seeds, cost_key)

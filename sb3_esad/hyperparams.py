@@ -1,0 +1,115 @@
+"""Hyperparameters that differ from the constructor's defaults, from plain YAML files that RL Zoo reads as well."""
+
+import difflib
+import inspect
+from inspect import Parameter
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import yaml
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+RUN_KEYS = ("n_timesteps", "n_envs")
+"""Keys of RL Zoo that concern the training and not the algorithm."""
+
+NAMED = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
+
+
+class Hyperparams(NamedTuple):
+    """
+    Settings of a training.
+
+    :param n_timesteps: environment steps
+    :param n_envs: environments side by side
+    :param arguments: of the algorithm's constructor
+    """
+
+    n_timesteps: int
+    n_envs: int
+    arguments: dict[str, Any]
+
+
+def load_hyperparams(algorithm: type[BaseAlgorithm], name: str, env_id: str) -> Hyperparams:
+    """
+    Look up the settings for an environment, or those under ``default``.
+
+    :param algorithm: class that shall be constructed
+    :param name: of the file, without ``.yml``
+    :param env_id: environment
+    :return: its settings
+    :raises ValueError: if the file is missing or no valid YAML, or if it has a key that the constructor does not know
+    """
+    path = hyperparams_folder() / f"{name}.yml"
+    entries = read_entries(path)
+    entry = entries.get(env_id, entries.get("default"))
+    if not isinstance(entry, dict):
+        raise ValueError(f"{path} has neither an entry '{env_id}' nor a 'default'; add one of them.")
+    arguments = {key: value for key, value in entry.items() if key not in RUN_KEYS}
+    check_keys(algorithm, arguments, path)
+    return Hyperparams(int(entry.get("n_timesteps", 100_000)), int(entry.get("n_envs", 1)), arguments)
+
+
+def hyperparams_folder() -> Path:
+    """
+    Find the YAML files, which an installed package holds and a clone has beside the package.
+
+    :return: their folder
+    """
+    package = Path(__file__).parent
+    installed = package / "hyperparams"
+    return installed if installed.is_dir() else package.parent / "hyperparams"
+
+
+def read_entries(path: Path) -> dict[str, Any]:
+    """
+    Read a YAML file of settings by environment id.
+
+    :param path: of the file
+    :return: its content
+    :raises ValueError: if it is missing or no mapping in valid YAML
+    """
+    try:
+        entries = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ValueError(f"There is no file {path}; there are {', '.join(_names(path.parent)) or 'none'}.") from error
+    except yaml.YAMLError as error:
+        raise ValueError(f"{path} is no valid YAML: {' '.join(str(error).split())}.") from error
+    if not isinstance(entries, dict):
+        raise ValueError(f"{path} holds no settings by environment id; see {hyperparams_folder() / 'esad_lend.yml'}.")
+    return entries
+
+
+def _names(folder: Path) -> list[str]:
+    return sorted(path.stem for path in folder.glob("*.yml"))
+
+
+def check_keys(algorithm: type[BaseAlgorithm], arguments: dict[str, Any], source: object) -> None:
+    """
+    Refuse settings that are no arguments of a constructor.
+
+    :param algorithm: class that shall be constructed
+    :param arguments: the settings
+    :param source: where they come from, for the message
+    :raises ValueError: at an unknown key; the message names the nearest argument
+    """
+    known = constructor_arguments(algorithm)
+    for key in arguments:
+        if key not in known:
+            near = difflib.get_close_matches(str(key), known, n=1, cutoff=0.0)[0]
+            raise ValueError(f"'{key}' in {source} is no argument of {algorithm.__name__}; did you mean '{near}'?")
+
+
+def constructor_arguments(algorithm: type[BaseAlgorithm]) -> set[str]:
+    """
+    List the arguments of a constructor, those it passes on to its base classes included.
+
+    :param algorithm: class
+    :return: their names, without ``env`` and private ones
+    """
+    names: set[str] = set()
+    for each in algorithm.__mro__:
+        parameters = inspect.signature(each).parameters.values()
+        names |= {parameter.name for parameter in parameters if parameter.kind in NAMED}
+        if all(parameter.kind is not Parameter.VAR_KEYWORD for parameter in parameters):
+            break
+    return {name for name in names if name != "env" and not name.startswith("_")}

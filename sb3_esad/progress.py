@@ -1,0 +1,91 @@
+"""Callbacks that follow a training: its episodes, its progress bar, its time."""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from stable_baselines3.common.callbacks import BaseCallback, ProgressBarCallback
+
+from sb3_esad.common.costs import CostReader, EpisodeCosts
+
+
+class TrainingEpisode(NamedTuple):
+    """
+    An episode of the training.
+
+    :param step: environment steps of the training when it ended
+    :param total_reward: its return
+    :param cost: what it has cost
+    :param driving_score: in %, nan outside driving scenarios
+    """
+
+    step: int
+    total_reward: float
+    cost: float
+    driving_score: float
+
+
+class EpisodeHistory(BaseCallback):
+    """Collects what became of the episodes of a training in ``episodes``; it needs a ``Monitor``, which SB3 adds by itself."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.episodes: list[TrainingEpisode] = []
+
+    def _on_training_start(self) -> None:
+        self._costs = EpisodeCosts()
+        self._read_costs = CostReader(getattr(self.model, "cost_key", "cost"))
+
+    def _on_step(self) -> bool:
+        infos = self.locals["infos"]
+        for over in self._costs.add(self._read_costs(infos), self.locals["dones"]):
+            info = infos[over.env]
+            score = 100 * info.get("driving", {}).get("driving_score", np.nan)
+            self.episodes.append(TrainingEpisode(self.num_timesteps, info["episode"]["r"], over.cost, score))
+        return True
+
+    def recent(self, count: int = 20) -> TrainingEpisode | None:
+        """
+        Average the latest episodes.
+
+        :param count: how many at most
+        :return: the means, None before the first episode has ended
+        """
+        latest = self.episodes[-count:]
+        return TrainingEpisode(*np.mean(latest, axis=0)) if latest else None
+
+
+class EpisodeProgressBar(ProgressBarCallback):
+    """
+    SB3's progress bar, which also shows the means of the latest training episodes.
+
+    :param history: collects the episodes; it must run before this callback
+    """
+
+    def __init__(self, history: EpisodeHistory) -> None:
+        super().__init__()
+        self.history = history
+
+    def _on_step(self) -> bool:
+        recent = self.history.recent()
+        if recent is not None:
+            self.pbar.set_description(f"driving score {recent.driving_score:.0f} %, cost {recent.cost:.2f}", refresh=False)
+        return super()._on_step()
+
+
+class StopAfter(BaseCallback):
+    """
+    Ends a training when its time is over.
+
+    :param minutes: from the start of the training
+    """
+
+    def __init__(self, minutes: float) -> None:
+        super().__init__()
+        self.minutes = minutes
+
+    def _on_training_start(self) -> None:
+        self._end = time.monotonic() + 60 * self.minutes
+
+    def _on_step(self) -> bool:
+        return time.monotonic() < self._end

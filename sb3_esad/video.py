@@ -1,0 +1,175 @@
+"""Videos of an episode, beside it what the model remembers and dreams of it."""
+
+import math
+from collections.abc import Iterable, Iterator
+from contextlib import closing
+from itertools import chain
+from pathlib import Path
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+
+from sb3_esad.common.save_util import whole_file
+from sb3_esad.dream import DreamingDriver
+from sb3_esad.driving_evaluation import DRIVERS, check_scenario
+from sb3_esad.esad_lend import ESADLEND
+from sb3_esad.panels import BAD, GOOD, Gauge, Picture, compose, paint
+
+LAST_FRAMES = 8
+SMALLEST_RISK = 1e-4
+
+
+def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, deterministic: bool = True) -> None:
+    """
+    Film an episode of a model, beside it what the model sees, remembers and dreams.
+
+    :param path: where to write the MP4
+    :param model: trained on images, or on a dictionary with an ``image``
+    :param env_id: driving scenario
+    :param seed: of the episode
+    :param deterministic: take the best action, not a sampled one
+    :raises ValueError: if the environment is no driving scenario with an image, or not one that the model knows
+    """
+    env = _make(env_id)
+    if _image_of(env.observation_space.sample()) is None:
+        raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
+    write_video(
+        path, _drive_dreaming(env, DreamingDriver(model, deterministic=deterministic), seed), env.metadata["render_fps"]
+    )
+
+
+def record_driver(path: Path, name: str, env_id: str, seed: int) -> None:
+    """
+    Film an episode of a scripted driver.
+
+    :param path: where to write the MP4
+    :param name: key of ``DRIVERS``
+    :param env_id: driving scenario
+    :param seed: of the episode
+    :raises ValueError: if the environment is no driving scenario
+    """
+    env = _make(env_id)
+    write_video(path, _drive(env, name, seed), env.metadata["render_fps"])
+
+
+def write_video(path: Path, frames: Iterable[Picture], fps: int) -> None:
+    """
+    Write an MP4 in H.264 with 4:2:0 colours, which every browser and player shows.
+
+    :param path: where to
+    :param frames: RGB pictures of one size, shape ``(rows, columns, 3)``
+    :param fps: pictures a second
+    :raises ValueError: if the path has another suffix than ``.mp4``
+    :raises ImportError: if imageio-ffmpeg is missing
+    """
+    if path.suffix not in ("", ".mp4"):
+        raise ValueError(f"{path} is no MP4; give the video a name that ends with .mp4.")
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError("Videos need imageio-ffmpeg: pip install 'sb3_esad[demo]'.") from error
+    pictures = iter(frames)
+    first = next(pictures)
+    options = {"fps": fps, "quality": 8, "output_params": ["-movflags", "+faststart"]}
+    with (
+        whole_file(path, ".mp4") as target,
+        closing(imageio_ffmpeg.write_frames(target, first.shape[1::-1], **options)) as writer,
+    ):
+        writer.send(None)
+        for picture in chain([first], pictures):
+            writer.send(np.ascontiguousarray(picture))
+
+
+def _make(env_id: str) -> gym.Env[Any, Any]:
+    env = gym.make(env_id)
+    check_scenario(env, env_id)
+    return gym.make(env_id, render_mode="rgb_array")
+
+
+def _drive(env: gym.Env[Any, Any], name: str, seed: int) -> Iterator[Picture]:
+    driver, done = DRIVERS[name](seed), False
+    env.reset(seed=seed)
+    while not done:
+        yield _render(env)
+        _, _, terminated, truncated, _ = env.step(driver(env))
+        done = terminated or truncated
+    yield from [_render(env)] * LAST_FRAMES
+
+
+def _drive_dreaming(env: gym.Env[Any, Any], driver: DreamingDriver, seed: int) -> Iterator[Picture]:
+    observation, info = env.reset(seed=seed)
+    verdict, cost = "", 0.0
+    while not verdict:
+        action = driver(observation)
+        yield _frame(env, driver, observation, info, cost, verdict)
+        observation, _, terminated, truncated, info = env.step(action)
+        cost += info["cost"]
+        if terminated or truncated:
+            verdict = _verdict(info, truncated)
+    driver(observation)
+    yield from [_frame(env, driver, observation, info, cost, verdict)] * LAST_FRAMES
+
+
+def _verdict(info: dict[str, Any], truncated: bool) -> str:
+    if truncated:
+        return "Time is up"
+    if info["is_success"]:
+        return "Arrived"
+    return "Off the road" if info["cost_terms"]["off_road"] else "Collision"
+
+
+def _frame(
+    env: gym.Env[Any, Any], driver: DreamingDriver, observation: Any, info: dict[str, Any], cost: float, verdict: str
+) -> Picture:
+    blind = driver.blind_steps / env.metadata["render_fps"]
+    dream = f"What it dreams, {blind:.1f} s without looking" if blind else "What it dreams, eyes open"
+    panels = {
+        "What it sees": paint(_image_of(observation) / 255.0),
+        "What it remembers of it": paint(_image_of(driver.reconstruction())[0].numpy()),
+        dream: paint(_image_of(driver.dream())[0].numpy()),
+    }
+    return compose(_render(env), panels, _gauges(env.unwrapped, driver, info, cost), verdict)
+
+
+def _gauges(scenario: Any, driver: DreamingDriver, info: dict[str, Any], cost: float) -> list[Gauge]:
+    config, speed, step_cost = scenario.config, info["speed"], info.get("cost", 0.0)
+    risk, limit = driver.risk(), driver.model.cost_limit
+    budget = driver.model.penalty.budget
+    allowed = "no limit" if limit is None else f"budget {100 * budget:.2f} %"
+    return [
+        Gauge(
+            "speed, target marked",
+            f"{speed:.1f} m/s",
+            speed / config["max_speed"],
+            config["target_speed"] / config["max_speed"],
+            GOOD,
+        ),
+        Gauge("cost of this step", f"{step_cost:.0f}   episode {cost:.0f}", step_cost, None, BAD),
+        Gauge(
+            f"predicted risk, {allowed}",
+            f"{100 * risk:.1f} %",
+            _risk_share(risk),
+            None if limit is None else _risk_share(budget),
+            GOOD if limit is None or risk <= budget else BAD,
+        ),
+        Gauge("route driven", f"{100 * (1 - scenario.remaining):.0f} %", 1 - scenario.remaining, None, GOOD),
+    ]
+
+
+def _risk_share(risk: float) -> float:
+    """Place on a logarithmic scale from 0.01 % to 100 %: a budget of 1 % must be told from none."""
+    return 1 - math.log10(min(max(risk, SMALLEST_RISK), 1.0)) / math.log10(SMALLEST_RISK)
+
+
+def _image_of(observation: Any) -> Any:
+    """The image in an observation or reconstruction, None if there is none."""
+    if isinstance(observation, dict):
+        return observation.get("image", observation.get("observation"))
+    return observation if np.ndim(observation) == 3 else None
+
+
+def _render(env: gym.Env[Any, Any]) -> Picture:
+    picture = env.render()
+    assert isinstance(picture, np.ndarray)
+    return picture
