@@ -1,4 +1,4 @@
-"""Steps per second of esad-highway-v0, beside stock highway-env with as many vehicles: ``python benchmark/scenario_speed.py``."""
+"""Steps per second of esad-highway-v0 beside stock highway-env: ``python benchmark/scenario_speed.py``."""
 
 import argparse
 import time
@@ -63,7 +63,9 @@ def main() -> None:
             rates[name].append(rate(env, args.steps))
     for name, values in rates.items():
         print(f"{name:16s} median {np.median(values):.0f} steps/s, from {min(values):.0f} to {max(values):.0f}")
-    print(f"ratio {np.median(rates['esad-highway-v0']) / np.median(rates['highway-fast-v0']):.1f} ({vehicles} vehicles, images)")
+    print(
+        f"ratio {np.median(rates['esad-highway-v0']) / np.median(rates['highway-fast-v0']):.1f} ({vehicles} vehicles, images)"
+    )
 
 
 if __name__ == "__main__":

@@ -12,6 +12,20 @@ from stable_baselines3.common.utils import set_random_seed
 
 th.set_num_threads(1)
 
+TINY: dict[str, Any] = {
+    "policy_kwargs": {"net_arch": [16], "memory_channels": 8, "latent_channels": 4},
+    "learning_starts": 20,
+    "buffer_size": 1000,
+    "batch_size": 4,
+    "sequence_length": 8,
+    "imagination_starts": 16,
+    "imagination_horizon": 3,
+    "pretrain_steps": 1,
+    "device": "cpu",
+    "seed": 0,
+}
+"""Arguments that make a model small and quick."""
+
 
 @pytest.fixture(autouse=True)
 def seed() -> Iterator[int]:

@@ -100,7 +100,7 @@ def test_multiplier_moves_whatever_callback_the_user_has() -> None:
     for callback in choices:
         model = make_model()
         model.learn(40, callback=callback)
-        assert model.penalty.n_observed == 40
+        assert model.penalty.n_observed == 30  # the first ten steps are random
         assert len(model.penalty.updates) == 8
         assert model.penalty.multiplier.item() > 1.0
     assert mine.n_inits == 1 and mine.n_calls == 40 and len(called) == 40
@@ -128,7 +128,7 @@ def test_several_environments_and_logs() -> None:
     model = make_model(DummyVecEnv([CountingEnv] * 3), train_freq=2)
     logged = record_logs(model)
     model.learn(60, log_interval=1)
-    assert model.penalty.n_observed == 60
+    assert model.penalty.n_observed == 60 - 9
     assert {"train/lagrangian_multiplier", "train/budget", "train/cost_calibration"} <= logged.keys()
 
 

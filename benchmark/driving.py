@@ -1,0 +1,135 @@
+"""
+Learning curves of driving: ``python benchmark/driving.py esad_lend --seed 0 --steps 20000 --out runs``.
+
+One run trains one algorithm with one seed, stops every so often to drive unseen episodes with the best and with sampled
+actions, and appends a line of JSON for each to ``OUT/<algorithm>_<seed>.jsonl``. Time spent on evaluation does not count.
+"""
+
+import argparse
+import json
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+
+from sb3_esad import ESADLEND
+from sb3_esad.driving_evaluation import evaluate_model
+from sb3_esad.envs.metrics import Record
+from sb3_esad.hyperparams import load_hyperparams
+
+ENV = "esad-highway-v0"
+UNSEEN = 2_000_000
+
+
+def esad_lend(seed: int, changes: dict[str, Any]) -> ESADLEND:
+    """
+    Build ESAD-LEND with the scenario's hyperparameters.
+
+    :param seed: of the training
+    :param changes: arguments of the constructor to replace
+    :return: the algorithm
+    """
+    arguments = {**load_hyperparams(ESADLEND, "esad_lend", ENV).arguments, **changes}
+    return ESADLEND(env=make_vec_env(ENV), seed=seed, **arguments)
+
+
+def sac(seed: int, changes: dict[str, Any]) -> SAC:
+    """
+    Build SB3's SAC for images that show speeds in one frame.
+
+    :param seed: of the training
+    :param changes: arguments of the constructor to replace
+    :return: the algorithm
+    """
+    arguments: dict[str, Any] = {"buffer_size": 20_000, "batch_size": 128, "gamma": 0.97, "learning_starts": 1000, **changes}
+    return SAC("CnnPolicy", make_vec_env(ENV), seed=seed, **arguments)
+
+
+ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {"esad_lend": esad_lend, "sac": sac}
+
+
+def summary(records: list[Record]) -> dict[str, float]:
+    """
+    Average what the tables need.
+
+    :param records: of the episodes
+    :return: driving score, route completion and collision-free share in %, speed in m/s, return, cost
+    """
+
+    def mean(key: str) -> float:
+        return float(np.mean([record[key] for record in records]))
+
+    return {
+        "DS": 100 * mean("driving_score"),
+        "RC": 100 * mean("route_completion"),
+        "collision_free": 100 * float(np.mean([record["collisions"] == 0 for record in records])),
+        "speed": mean("mean_speed"),
+        "return": mean("return"),
+        "cost": mean("cost"),
+    }
+
+
+class LearningCurve(BaseCallback):
+    """
+    Drives unseen episodes every ``every`` steps.
+
+    :param path: file to which lines of JSON are appended
+    :param every: environment steps
+    :param episodes: of each evaluation
+    """
+
+    def __init__(self, path: Path, every: int, episodes: int) -> None:
+        super().__init__()
+        self.path, self.every, self.episodes = path, every, episodes
+
+    def _on_training_start(self) -> None:
+        self._next, self._seconds, self._resumed, self._cost = self.every, 0.0, time.monotonic(), 0.0
+
+    def _on_step(self) -> bool:
+        self._cost += sum(info["cost"] for info in self.locals["infos"])
+        if self.num_timesteps >= self._next:
+            self._next += self.every
+            self._seconds += time.monotonic() - self._resumed
+            self._evaluate()
+            self._resumed = time.monotonic()
+        return True
+
+    def _evaluate(self) -> None:
+        seeds = range(UNSEEN, UNSEEN + self.episodes)
+        line = {"steps": self.num_timesteps, "seconds": round(self._seconds), "training_cost": self._cost}
+        for name, deterministic in (("best", True), ("sampled", False)):
+            line[name] = summary(evaluate_model(self.model, ENV, seeds, deterministic))
+        with self.path.open("a") as file:
+            file.write(json.dumps(line) + "\n")
+        self.model.save(self.path.with_suffix(".zip"))
+        print(json.dumps(line), flush=True)
+
+
+def main() -> None:
+    """Train and evaluate."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("algorithm", choices=list(ALGORITHMS))
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--every", type=int, default=1500)
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--set", type=json.loads, default={}, help="JSON of constructor arguments to replace")
+    args = parser.parse_args()
+    th.set_num_threads(args.threads)
+    args.out.mkdir(parents=True, exist_ok=True)
+    path = args.out / f"{args.algorithm}_{args.seed}.jsonl"
+    path.unlink(missing_ok=True)
+    ALGORITHMS[args.algorithm](args.seed, args.set).learn(args.steps, callback=LearningCurve(path, args.every, args.episodes))
+
+
+if __name__ == "__main__":
+    main()
