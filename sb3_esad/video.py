@@ -126,8 +126,8 @@ def _frame(
     dream = f"What it dreams, {blind:.1f} s without looking" if blind else "What it dreams, eyes open"
     panels = {
         "What it sees": paint(_image_of(observation) / 255.0),
-        "What it remembers of it": paint(_image_of(driver.reconstruction())[0].numpy()),
-        dream: paint(_image_of(driver.dream())[0].numpy()),
+        "What it remembers of it": paint(_image_of(driver.reconstruction())[0].cpu().numpy()),
+        dream: paint(_image_of(driver.dream())[0].cpu().numpy()),
     }
     return compose(_render(env), panels, _gauges(env.unwrapped, driver, info, cost), verdict)
 

@@ -204,10 +204,12 @@ def read_video(path: Path) -> tuple[int, tuple[int, ...], str]:
     return len(frames), frames[0].shape, code
 
 
-def test_record_model(model: ESADLEND, tmp_path: Path) -> None:
-    record_model(tmp_path / "episode.mp4", model, "short-image-v0", seed=3)
+@pytest.mark.parametrize("policy", ["CnnPolicy", "MultiInputPolicy"])
+def test_record_model(policy: str, tmp_path: Path) -> None:
+    model, env_id = make_model(policy), ENV_IDS[policy]
+    record_model(tmp_path / "episode.mp4", model, env_id, seed=3)
     n_frames, shape, code = read_video(tmp_path / "episode.mp4")
-    steps = int(evaluate_model(model, "short-image-v0", [3])[0]["steps"])
+    steps = int(evaluate_model(model, env_id, [3])[0]["steps"])
     assert steps < n_frames <= steps + 10
     assert shape == (SIZE[1], SIZE[0], 3)
     assert code in ("h264", "avc1")

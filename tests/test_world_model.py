@@ -257,7 +257,6 @@ def test_targets_belong_to_the_state_arrived_at(monkeypatch: pytest.MonkeyPatch,
         caught.append((grid, targets, weights))
         return th.zeros(()), {}
 
-    monkeypatch.setattr(model, "_withhold", th.zeros_like)
     monkeypatch.setattr(model, "_withhold", lambda steps: th.zeros_like(steps, dtype=th.bool))
     monkeypatch.setattr(model.predictions, "loss", catch)
     samples = buffer.sample(16)
@@ -285,10 +284,10 @@ def toy_samples(space: spaces.Space, n: int = 8, length: int = 8) -> SequenceSam
 
 @pytest.mark.parametrize("kind", SPACES)
 def test_learns_a_deterministic_world(kind: str) -> None:
-    model = make_policy(SPACES[kind]).world_model
+    model = make_policy(SPACES[kind], lr=1e-2).world_model
     samples = toy_samples(SPACES[kind])
     losses = []
-    for _ in range(50):
+    for _ in range(40):
         with precision.autocast(th.device("cpu")):
             loss, _, logs = model.loss(samples)
         model.optimizer.zero_grad()

@@ -11,6 +11,7 @@ from sb3_esad.common.torch_layers import GridReadout, GridShape, conv_block
 
 FOREGROUND_CONTRAST = 0.1
 MEDIAN_SAMPLE = 32
+MEDIAN_RATE = 0.02
 
 
 class ObservationHead(nn.Module, ABC):
@@ -38,14 +39,17 @@ class ObservationHead(nn.Module, ABC):
 
 class ImageHead(ObservationHead):
     """
-    Reconstruct an image, with more weight on the pixels that differ from the usual background.
+    Reconstruct an image, with more weight on what is rare.
+
+    In each channel the pixels that differ from its median weigh as much together as those that do not, within bounds. A median
+    of each pixel would be no background here: the agent's own car always stands in the same place.
 
     Squared errors are taken on patches of 4x4 pixels, as the network puts them out: to sort the pixels of a batch costs more
     than a layer.
 
     :param grid_shape: shape of the latent grid (C, H, W), one cell for 8x8 pixels
     :param image_shape: shape of the image (C, H, W)
-    :param foreground_weight: additional weight of a pixel that differs from its running median by more than 0.1
+    :param foreground_weight: largest additional weight of a pixel that differs from its channel's median by more than 0.1
     :param channels: channels of the hidden layers
     """
 
@@ -62,7 +66,7 @@ class ImageHead(ObservationHead):
             conv_block(grid_shape[0], 4 * channels, 1), nn.PixelShuffle(2), conv_block(channels, channels, 3)
         )
         self.pixels = nn.Linear(channels, 16 * image_shape[0])
-        self.register_buffer("background", th.zeros(2 * self.cells[0], 2 * self.cells[1], 16 * image_shape[0]))
+        self.register_buffer("background", th.zeros(image_shape[0], 1))
 
     def forward(self, grid: th.Tensor) -> th.Tensor:
         """
@@ -85,21 +89,27 @@ class ImageHead(ObservationHead):
         _, height, width = self.image_shape
         padded = nn.functional.pad(observations, (0, -width % 8, 0, -height % 8))
         patches = nn.functional.pixel_unshuffle(padded, 4).movedim(1, -1).contiguous()
-        self._follow_median(patches[:: math.ceil(len(patches) / MEDIAN_SAMPLE)])
-        foreground = (patches - self.background.to(patches.dtype)).abs() > FOREGROUND_CONTRAST
-        weights = 1 + self.foreground_weight * foreground.to(patches.dtype)
-        return (weights * (self._patches(grid) - patches).square()).sum(dtype=th.float32) / len(observations)
+        pixels = patches.unflatten(-1, (-1, 16))
+        weights = self._weights(pixels)
+        error = self._patches(grid).unflatten(-1, (-1, 16)) - pixels
+        return (weights * error.square()).sum(dtype=th.float32) / len(observations)
+
+    @th.no_grad()
+    def _weights(self, pixels: th.Tensor) -> th.Tensor:
+        """Weights of pixels, both of shape (N, rows, columns, channels, 16)."""
+        # The median's fixed point has as many values above as below: no memory of past images is needed
+        sample = pixels[:: math.ceil(len(pixels) / MEDIAN_SAMPLE)]
+        self.background += MEDIAN_RATE * (sample - self.background).sign().mean((0, 1, 2, 4))[:, None]
+        foreground = ((pixels - self.background.to(pixels.dtype)).abs() > FOREGROUND_CONTRAST).to(pixels.dtype)
+        share = foreground.mean((0, 1, 2, 4), dtype=th.float32)
+        balance = ((1 - share) / share).clamp(1, 1 + self.foreground_weight)
+        return 1 + (balance - 1).to(pixels.dtype)[:, None] * foreground
 
     def _patches(self, grid: th.Tensor) -> th.Tensor:
         """Patches of 4x4 pixels, of shape (N, rows, columns, 16 * channels)."""
         if grid.shape[-2:] != self.cells:
             grid = nn.functional.interpolate(grid, self.cells)
         return self.pixels(self.layers(grid).movedim(1, -1))
-
-    @th.no_grad()
-    def _follow_median(self, patches: th.Tensor, rate: float = 0.02) -> None:
-        # Its fixed point has as many values above as below, and it needs no memory of past images
-        self.background += rate * (patches - self.background).sign().mean(0)
 
 
 class VectorHead(ObservationHead):

@@ -26,9 +26,11 @@ class GridGRU(nn.Module):
     def __init__(self, memory_shape: GridShape, input_channels: int, action_dim: int) -> None:
         super().__init__()
         channels = memory_shape[0]
-        self.local = same_conv(channels + input_channels, 3 * channels, kernel_size(memory_shape))
-        self.everywhere = nn.Linear(channels + action_dim, 3 * channels)
-        self.norm = ChannelNorm(3 * channels)
+        hidden = 2 * channels
+        self.local = same_conv(channels + input_channels, hidden, kernel_size(memory_shape))
+        self.everywhere = nn.Linear(channels + action_dim, hidden)
+        self.norm = ChannelNorm(hidden)
+        self.gates = nn.Sequential(same_conv(hidden, 3 * channels, 1), ChannelNorm(3 * channels))
 
     def forward(self, memory: th.Tensor, inputs: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
@@ -40,7 +42,9 @@ class GridGRU(nn.Module):
         :return: the next memory, of the shape of ``memory``
         """
         common = self.everywhere(th.cat([memory.mean((-2, -1)), action], dim=1))
-        gates = self.norm(self.local(th.cat([memory, inputs], dim=1)) + common[..., None, None])
+        # A hidden layer, for what moves must be shifted by its speed: a product, which gates alone express badly
+        hidden = nn.functional.silu(self.norm(self.local(th.cat([memory, inputs], dim=1)) + common[..., None, None]))
+        gates = self.gates(hidden)
         reset, candidate, update = gates.float().chunk(3, dim=1)
         # The bias of -1 makes the memory keep what it holds until it learns what to replace (DreamerV2)
         update = th.sigmoid(update - 1)

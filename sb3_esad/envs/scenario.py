@@ -117,9 +117,14 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         """Whether the episode ends in a terminal state."""
         return self.crashed or self._is_success()
 
+    @property
+    def max_episode_steps(self) -> int:
+        """Decisions after which an episode is truncated."""
+        return round(self.config["duration"] * self.config["policy_frequency"])
+
     def _is_truncated(self) -> bool:
         """Whether time is up."""
-        return self.episode.steps >= round(self.config["duration"] * self.config["policy_frequency"])
+        return self.episode.steps >= self.max_episode_steps
 
     @property
     def heading_error(self) -> float:

@@ -30,7 +30,7 @@ from sb3_esad.esad_lend.targets import (
     taken,
 )
 
-UNKNOWN_LENGTH = 1000
+UNKNOWN_LENGTH = 1000.0
 
 
 class ESADLEND(LatentAlgorithm):
@@ -145,8 +145,12 @@ class ESADLEND(LatentAlgorithm):
 
     def _episode_length(self) -> float:
         """Longest episode the environment admits, until episodes have been seen."""
-        specs = self.env.get_attr("spec") if self.env is not None else []
-        return float(next((spec.max_episode_steps for spec in specs if spec and spec.max_episode_steps), UNKNOWN_LENGTH))
+        if self.env is None:
+            return UNKNOWN_LENGTH
+        if self.env.has_attr("max_episode_steps"):
+            return float(self.env.get_attr("max_episode_steps")[0])
+        spec = self.env.get_attr("spec")[0]
+        return float(spec.max_episode_steps or UNKNOWN_LENGTH) if spec else UNKNOWN_LENGTH
 
     @property
     def _cost_gamma(self) -> float:

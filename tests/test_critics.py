@@ -1,0 +1,224 @@
+"""Critics: they learn the mean and the spread of what is known, and their targets are constants."""
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+import torch as th
+
+from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, QEnsemble, make_target
+from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.type_aliases import Imagination, Predictions
+from sb3_esad.esad_lend.targets import (
+    CostTargets,
+    Transitions,
+    cost_targets,
+    recorded_cost_targets,
+    recorded_return_targets,
+    return_targets,
+)
+
+SHAPE = (1, 1, 1)
+GAMMA = 0.95
+HAZARDS = [(0.01, 0.1681, 0.2562), (0.05, 0.5128, 0.2959)]
+"""Chance of a crash at each step, and mean and deviation of the discounted cost of a life under it."""
+
+
+def state_and_action(n: int = 1) -> tuple[th.Tensor, th.Tensor]:
+    """The only state there is, and the only action."""
+    return th.ones(n, *SHAPE), th.zeros(n, 1)
+
+
+def hazard_dream(hazard: float, steps: int, reward: float = 0.0) -> Imagination:
+    """What a perfect model imagines of one life: expected values, the same at every step."""
+    ones = th.ones(steps, 1)
+    predictions = Predictions(reward * ones, hazard * ones, (1 - hazard) * ones)
+    weights = (GAMMA * predictions.continues).cumprod(0)
+    return Imagination(th.ones(steps + 1, 1, *SHAPE), th.zeros(steps + 1, 1, 1), predictions, weights)
+
+
+def hazard_record(hazard: float, n: int) -> Transitions:
+    """What really happens to many lives, as drawn by chance."""
+    grids, actions = state_and_action(n)
+    crashes = (th.rand(n) < hazard).float()
+    return Transitions(grids, actions, grids, actions, Predictions(th.zeros(n), crashes, 1 - crashes), th.ones(n))
+
+
+def cost_policy(bound: float = 1.0) -> LatentPolicy:
+    """All of a policy that the targets of the cost look at."""
+    critic = CostCritic(SHAPE, 1, [8])
+    critic.raise_bound(bound)
+    return cast(LatentPolicy, SimpleNamespace(cost_critic=critic, cost_critic_target=make_target(critic)))
+
+
+def fit(policy: LatentPolicy, make_targets: Any, n: int, steps: int = 300) -> tuple[float, float]:
+    """Fitted Q iteration, the target following at once; an average over the last steps."""
+    critic = policy.cost_critic
+    optimizer = th.optim.Adam(critic.parameters(), lr=0.02)
+    schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)
+    estimates = []
+    for step in range(steps):
+        targets = make_targets()
+        mean_loss, variance_loss = critic.loss(*state_and_action(n), targets.means.flatten(), targets.variances.flatten())
+        optimizer.zero_grad()
+        (mean_loss + variance_loss).mean().backward()
+        optimizer.step()
+        schedule.step()
+        policy.cost_critic_target.load_state_dict(critic.state_dict())
+        if step >= steps // 2:
+            means, variance = critic(*state_and_action())
+            estimates.append([means.mean().item(), variance.sqrt().item()])
+    mean, deviation = th.tensor(estimates).mean(0).tolist()
+    return mean, deviation
+
+
+@pytest.mark.parametrize(("hazard", "mean", "deviation"), HAZARDS)
+@pytest.mark.parametrize("bound", [1.0, 20.0])
+def test_hazard_chain_learned_from_dreams(hazard: float, mean: float, deviation: float, bound: float) -> None:
+    policy, dream = cost_policy(bound), hazard_dream(hazard, steps=5)
+    learned = fit(policy, lambda: cost_targets(policy, dream, GAMMA, 0.95, continue_after_cost=0.0), n=5)
+    assert learned == pytest.approx((mean, deviation), rel=0.05)
+
+
+@pytest.mark.parametrize(("hazard", "mean", "deviation"), HAZARDS)
+def test_hazard_chain_learned_from_the_road(hazard: float, mean: float, deviation: float) -> None:
+    policy = cost_policy()
+
+    def draw() -> CostTargets:
+        return recorded_cost_targets(policy, hazard_record(hazard, 2048), GAMMA)
+
+    learned = fit(policy, draw, n=2048)
+    assert learned == pytest.approx((mean, deviation), rel=0.05)
+
+
+def test_costs_that_do_not_end_the_episode() -> None:
+    """A cost of probability p at every step, forever: mean p / (1 - gamma), variance p (1 - p) / (1 - gamma^2)."""
+    policy, steps, p = cost_policy(bound=1 / (1 - GAMMA)), 5, 0.1
+    dream = hazard_dream(p, steps)
+    predictions = dream.predictions._replace(continues=th.ones(steps, 1))
+    dream = dream._replace(predictions=predictions)
+    learned = fit(policy, lambda: cost_targets(policy, dream, GAMMA, 0.95, continue_after_cost=1.0), n=steps)
+    assert learned == pytest.approx((p / (1 - GAMMA), (p * (1 - p) / (1 - GAMMA**2)) ** 0.5), rel=0.05)
+
+
+def test_targets_of_the_mean_are_the_mean_of_the_critics() -> None:
+    """Pessimism within the bootstrap would compound."""
+    policy = cost_policy()
+    dream, record = hazard_dream(0.0, steps=1), hazard_record(0.0, 3)
+    means, variance = policy.cost_critic_target(*state_and_action())
+    assert abs(means[0] - means[1]) > 1e-4
+    imagined = cost_targets(policy, dream, GAMMA, 0.95, 0.0)
+    recorded = recorded_cost_targets(policy, record, GAMMA)
+    expected_variance = (GAMMA * means.mean() - means.mean()) ** 2 + GAMMA**2 * variance
+    for targets in (imagined, recorded):
+        th.testing.assert_close(targets.means.flatten(), GAMMA * means.mean().expand(targets.means.numel()))
+        th.testing.assert_close(targets.variances.flatten(), expected_variance.expand(targets.means.numel()))
+
+
+def reward_policy() -> LatentPolicy:
+    critic = QEnsemble(SHAPE, 1, [8])
+    for network in critic.q_networks:
+        th.nn.init.normal_(cast(Any, network)[-1].weight, std=0.3)
+    return cast(LatentPolicy, SimpleNamespace(critic=critic, critic_target=make_target(critic)))
+
+
+def test_return_targets_take_the_smaller_critic_and_stop_at_the_end() -> None:
+    policy = reward_policy()
+    values = policy.critic_target(*state_and_action())
+    assert values[0] != values[1]
+    smaller = values.min()
+    imagined = return_targets(policy, hazard_dream(0.2, 1, reward=3.0), GAMMA, 0.95)
+    th.testing.assert_close(imagined, (3.0 + GAMMA * 0.8 * smaller).view(1, 1))
+    grids, actions = state_and_action(2)
+    outcomes = Predictions(th.tensor([1.0, 2.0]), th.zeros(2), th.tensor([1.0, 0.0]))
+    record = Transitions(grids, actions, grids, actions, outcomes, th.ones(2))
+    expected = th.stack([1.0 + GAMMA * smaller, th.tensor(2.0)])
+    th.testing.assert_close(recorded_return_targets(policy, record, GAMMA), expected)
+
+
+def test_targets_have_no_gradient() -> None:
+    costs, rewards, record = cost_policy(), reward_policy(), hazard_record(0.1, 3)
+    dream = hazard_dream(0.1, 3)
+    targets = [
+        *cost_targets(costs, dream, GAMMA, 0.95, 0.0),
+        *recorded_cost_targets(costs, record, GAMMA),
+        return_targets(rewards, dream, GAMMA, 0.95),
+        recorded_return_targets(rewards, record, GAMMA),
+    ]
+    assert not any(target.requires_grad for target in targets)
+
+
+def test_target_networks_are_frozen_copies() -> None:
+    critic = CostCritic(SHAPE, 1, [8])
+    target = make_target(critic)
+    assert not target.training and not any(parameter.requires_grad for parameter in target.parameters())
+    before = target(*state_and_action())
+    with th.no_grad():
+        for parameter in critic.parameters():
+            parameter.add_(1.0)
+    for one, other in zip(before, target(*state_and_action()), strict=True):
+        th.testing.assert_close(one, other)
+
+
+def test_cost_critic_starts_near_zero_and_is_never_certain() -> None:
+    means, variance = CostCritic(SHAPE, 1, [8])(*state_and_action())
+    assert (means < 0.05).all() and MIN_VARIANCE < variance < 0.05
+    critic = CostCritic(SHAPE, 1, [8])
+    for parameter in critic.parameters():
+        th.nn.init.constant_(parameter, -100.0)
+    means, variance = critic(*state_and_action())
+    assert variance.item() == pytest.approx(MIN_VARIANCE)
+    variance.sqrt().backward()
+    assert all(parameter.grad is None or parameter.grad.isfinite().all() for parameter in critic.parameters())
+
+
+def test_raised_bound_keeps_small_estimates() -> None:
+    critic = CostCritic(SHAPE, 1, [8])
+    before, variance_before = critic(*state_and_action())
+    critic.raise_bound(33.0)
+    after, variance_after = critic(*state_and_action())
+    assert critic.bound.item() == 33.0
+    th.testing.assert_close(after, before, rtol=0.05, atol=0)
+    th.testing.assert_close(variance_after, variance_before)
+    critic.raise_bound(2.0)
+    assert critic.bound.item() == 33.0, "it is never lowered"
+    again, _ = critic(*state_and_action())
+    th.testing.assert_close(again, after)
+
+
+def test_mean_stays_within_its_bound() -> None:
+    critic = CostCritic(SHAPE, 1, [8])
+    critic.raise_bound(4.0)
+    means, _ = critic(th.full((1, *SHAPE), 1e6), th.full((1, 1), 1e6))
+    assert ((means >= 0) & (means <= 4.0)).all()
+    loss, _ = critic.loss(*state_and_action(), th.tensor([9.0]), th.zeros(1))  # a target beyond the bound counts as the bound
+    at_bound, _ = critic.loss(*state_and_action(), th.tensor([4.0]), th.zeros(1))
+    th.testing.assert_close(loss, at_bound)
+
+
+def test_reward_critics_decode_what_they_were_fitted_to() -> None:
+    critic = QEnsemble((2, 1, 1), 1, [16])
+    grids, actions = th.randn(6, 2, 1, 1), th.randn(6, 1)
+    targets = th.tensor([-50.0, -2.0, 0.0, 0.5, 7.0, 400.0])
+    assert critic(grids, actions).abs().max() < 1e-3, "untrained critics expect nothing"
+    optimizer = th.optim.Adam(critic.parameters(), lr=0.02)
+    for _ in range(300):
+        loss = critic.loss(grids, actions, targets)
+        assert loss.shape == (6,)
+        optimizer.zero_grad()
+        loss.mean().backward()
+        optimizer.step()
+    th.testing.assert_close(critic(grids, actions), targets.expand(2, -1), rtol=0.05, atol=0.1)
+
+
+def test_return_scale_is_the_spread_but_never_below_one() -> None:
+    critic = QEnsemble(SHAPE, 1, [8])
+    returns = th.arange(101.0).view(1, 101)
+    for _ in range(800):
+        critic.follow_scale(returns)
+    assert critic.scale.item() == pytest.approx(90.0, rel=0.01)
+    for _ in range(2000):
+        critic.follow_scale(returns / 1e6)
+    assert critic.scale.item() == 1.0
+    critic.follow_scale(returns, rate=1.0)
+    assert critic.scale.item() == pytest.approx(90.0)

@@ -1,0 +1,426 @@
+"""ESAD-LEND: each update moves one network only, what is executed is what is remembered, costs are kept account of."""
+
+import inspect
+from types import SimpleNamespace
+from typing import Any, cast
+
+import gymnasium as gym
+import numpy as np
+import pytest
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.type_aliases import MaybeCallback
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+
+from sb3_esad import ESADLEND
+from sb3_esad.common.functional import barrier_residual, discounted_budget
+from sb3_esad.common.latents import Gaussian
+from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
+from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.type_aliases import Imagination, LatentState, SequenceSamples
+from sb3_esad.esad_lend.targets import recorded_transitions
+from tests.conftest import TINY, CountingEnv
+
+NETWORKS = ("world_model", "actor", "critic", "cost_critic")
+
+
+class FreeEnv(CountingEnv):
+    """Nothing costs."""
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        obs, reward, terminated, truncated, _ = super().step(action)
+        return obs, reward, terminated, truncated, {"cost": 0.0}
+
+
+class RecordingEnv(CountingEnv):
+    """Remembers the actions it was given."""
+
+    action_space = spaces.Box(np.float32([-3.0, 0.0]), np.float32([5.0, 1.0]))
+
+    def __init__(self, **kwargs: Any) -> None:
+        super().__init__(**kwargs)
+        self.actions: list[np.ndarray] = []
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        self.actions.append(np.array(action))
+        return super().step(action)
+
+
+def make_model(env: gym.Env | VecEnv | None = None, **kwargs: Any) -> ESADLEND:
+    return ESADLEND("MlpPolicy", env or CountingEnv(), **{**TINY, **kwargs})
+
+
+def imagine(model: ESADLEND) -> tuple[SequenceSamples, Filtered, Imagination]:
+    """Draw recorded windows, filter them and imagine from there."""
+    samples = model._sample(4)
+    with th.no_grad():
+        _, filtered, _ = model.policy.world_model.loss(samples)
+    return samples, filtered, model._imagine(samples, filtered)
+
+
+def with_gradient(model: ESADLEND) -> set[str]:
+    return {
+        name
+        for name, network in model.policy.named_children()
+        if any(parameter.grad is not None for parameter in network.parameters())
+    }
+
+
+def forget_gradients(model: ESADLEND) -> None:
+    for parameter in model.policy.parameters():
+        parameter.grad = None
+
+
+def test_each_update_moves_one_network() -> None:
+    model = make_model().learn(24)
+    samples, filtered, imagined = imagine(model)
+    recorded = recorded_transitions(model.policy, samples, filtered)
+    updates = {
+        "world_model": lambda: model._update_world_model(samples),
+        "critic": lambda: model._update_critic(imagined, recorded),
+        "cost_critic": lambda: model._update_cost_critic(imagined, recorded),
+        "actor": lambda: model._update_actor(imagined),
+    }
+    for name, update in updates.items():
+        forget_gradients(model)
+        before = {each: th.nn.utils.parameters_to_vector(getattr(model.policy, each).parameters()) for each in NETWORKS}
+        update()
+        assert with_gradient(model) == {name}
+        for each, vector in before.items():
+            same = th.equal(vector, th.nn.utils.parameters_to_vector(getattr(model.policy, each).parameters()))
+            assert same == (each != name)
+
+
+def test_targets_follow_slowly() -> None:
+    model = make_model(tau=0.25).learn(24)
+    policy = model.policy
+    pairs = [(policy.critic, policy.critic_target), (policy.cost_critic, policy.cost_critic_target)]
+    old = [[parameter.clone() for parameter in target.parameters()] for _, target in pairs]
+    model._update_behavior(*imagine(model))
+    for (network, target), parameters in zip(pairs, old, strict=True):
+        for new, moved, before in zip(network.parameters(), target.parameters(), parameters, strict=True):
+            th.testing.assert_close(moved, 0.75 * before + 0.25 * new)
+
+
+class KnownCritic(th.nn.Module):
+    """More is better: Q = a."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.scale = th.tensor(1.0)
+
+    def forward(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return actions[:, 0].expand(2, -1)
+
+
+class KnownCostCritic(th.nn.Module):
+    """More is riskier: the mean of the cost is a^2, its deviation a / 2; the second critic sees less danger."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.bound = th.tensor(100.0)
+
+    def forward(self, grids: th.Tensor, actions: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        mean = actions[:, 0].square()
+        return th.stack([mean, 0.5 * mean]), 0.25 * mean + 1e-8
+
+
+@pytest.mark.parametrize(
+    ("settings", "best"),
+    [
+        ({"cost_limit": None}, 1.0),
+        ({"cost_limit": 0.1, "risk_level": 1.0}, 0.25),  # a - 2 a^2
+        ({"cost_limit": 0.1, "risk_level": 0.5}, 0.0505),  # a - 2 (a^2 + 0.7979 a / 2)
+        ({"cost_limit": 0.1, "risk_level": 0.9}, 0.2220),  # a - 2 a^2 / 0.9 up to a = 0.88, for CVaR is at most E / alpha
+    ],
+)
+def test_actor_finds_the_best_of_known_values(settings: dict[str, Any], best: float) -> None:
+    """A multiplier of 2 weighs the risk against the value; entropy has no part in it."""
+    fixed = {"lagrangian_multiplier_init": 2.0, "penalty_coef": 0.0, "ent_coef": 0.0, "learning_rate": 0.02}
+    model = make_model(**{**fixed, **settings}).learn(24)
+    model.policy.critic, model.policy.cost_critic = cast(Any, KnownCritic()), cast(Any, KnownCostCritic())
+    _, _, imagined = imagine(model)
+    for _ in range(150):
+        model._update_actor(imagined)
+    actions = model.policy.actor(imagined.grids[0], deterministic=True)
+    # The rest is due to the spread of the policy, which cannot vanish
+    assert actions.mean().item() == pytest.approx(best, abs=0.05)
+
+
+def actor_gradient(model: ESADLEND, imagined: Imagination) -> th.Tensor:
+    """Gradient of the actor's loss; the policy stays as it is."""
+    state, moments = model.policy.actor.state_dict(), model.policy.actor.optimizer.state_dict()
+    saved = {name: value.clone() for name, value in state.items()}
+    th.manual_seed(0)
+    model._update_actor(imagined)
+    model.policy.actor.load_state_dict(saved)
+    model.policy.actor.optimizer.load_state_dict(moments)
+    return th.cat([parameter.grad.flatten() for parameter in model.policy.actor.parameters() if parameter.grad is not None])
+
+
+@pytest.mark.parametrize("cost_limit", [None, 0.05])
+def test_without_a_limit_costs_do_not_reach_the_actor(cost_limit: float | None) -> None:
+    model = make_model(cost_limit=cost_limit).learn(24)
+    _, _, imagined = imagine(model)
+    before = actor_gradient(model, imagined)
+    for parameter in model.policy.cost_critic.parameters():
+        th.nn.init.uniform_(parameter, -1.0, 1.0)
+    scrambled = actor_gradient(model, imagined)
+    assert th.equal(before, scrambled) == (cost_limit is None)
+    for parameter in model.policy.cost_critic.parameters():
+        th.nn.init.constant_(parameter, th.nan)
+    assert actor_gradient(model, imagined).isfinite().all() == (cost_limit is None)
+
+
+def test_limits_choose_their_penalty() -> None:
+    assert isinstance(make_model(cost_limit=None).penalty, NoPenalty)
+    strict = make_model(cost_limit=0.0).penalty
+    assert isinstance(strict, AugmentedLagrangian) and strict.budget == 0.0
+    usual = make_model(cost_limit=0.05, cost_gamma=0.9).penalty
+    assert isinstance(usual, AugmentedLagrangian)
+    assert usual.budget == pytest.approx(discounted_budget(0.05, 0.9, 1000))
+    assert make_model(gamma=0.8).penalty.cost_gamma == 0.8
+
+
+def test_budget_knows_the_time_limit() -> None:
+    gym.register("limited-v0", CountingEnv, max_episode_steps=40)
+    model = ESADLEND("MlpPolicy", "limited-v0", cost_limit=0.05, cost_gamma=0.95, **TINY)
+    assert model.penalty.budget == pytest.approx(0.0218, abs=1e-4)
+
+
+class CountCalls(BaseCallback):
+    """A callback of the user's."""
+
+    def _on_step(self) -> bool:
+        return True
+
+
+def test_penalty_takes_part_whatever_callback_the_user_has() -> None:
+    calls: list[int] = []
+
+    def function(locals_: dict[str, Any], globals_: dict[str, Any]) -> bool:
+        calls.append(1)
+        return True
+
+    mine = CountCalls()
+    choices: list[MaybeCallback] = [None, mine, [CountCalls(), CountCalls()], function]
+    for callback in choices:
+        model = make_model().learn(40, callback=callback)
+        assert model.penalty.n_updates.item() == model._n_updates - 1, "the last update is followed by no rollout"
+        assert "train/lagrangian_multiplier" in model.logger.name_to_value
+    assert mine.n_calls == len(calls) == 40
+
+
+def test_a_violation_is_taken_once() -> None:
+    model = make_model(learning_starts=10).learn(13)
+    assert model._n_updates == 1 and model.take_violation() is None, "the critics knew nothing when these steps were made"
+    model.learn(4, reset_num_timesteps=False)
+    for _ in range(2):
+        model._sample_action(0)
+    violation = model.take_violation()
+    assert violation is not None and violation.isfinite()
+    assert model.take_violation() is None
+
+
+def test_as_many_updates_as_steps() -> None:
+    env = make_vec_env(CountingEnv, n_envs=2)
+    model = make_model(env, learning_starts=0, train_freq=3, gradient_steps=-1)
+    model.learn(total_timesteps=3 * env.num_envs)
+    assert model.logger.name_to_value["train/n_updates"] == 3 * env.num_envs
+
+
+def test_pretraining_comes_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_model(pretrain_steps=5, learning_starts=8)
+    updates: list[int] = []
+    fit = model._update_world_model
+    monkeypatch.setattr(model, "_update_world_model", lambda samples: updates.append(model._n_updates) or fit(samples))
+    model.learn(20)
+    assert updates == [0] * 6 + [1, 2]
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+@pytest.mark.parametrize("noisy", [False, True])
+def test_executed_actions_are_remembered(n_envs: int, noisy: bool) -> None:
+    """In the environment, in the replay buffer and in the memory: the same action, after noise and clipping."""
+    noise = NormalActionNoise(np.zeros(2), np.full(2, 2.0)) if noisy else None
+    env = DummyVecEnv([lambda: RecordingEnv(episode_length=6)] * n_envs)
+    model = make_model(env, learning_starts=10, action_noise=noise)
+    memories: list[np.ndarray] = []
+
+    def remember(locals_: dict[str, Any], _: dict[str, Any]) -> bool:
+        assert model._last_latent is not None
+        memories.append(model._last_latent.action.numpy().copy())
+        return True
+
+    model.learn(20 * n_envs, callback=remember)
+    executed = np.stack([each.actions for each in env.envs], axis=1)  # type: ignore[attr-defined]
+    stored = model.replay_buffer.actions[:20]
+    np.testing.assert_array_equal(stored, np.stack(memories))
+    np.testing.assert_allclose(executed, model.policy.unscale_action(stored), atol=1e-6)
+    assert np.abs(stored).max() <= 1.0 and executed.dtype == np.float32
+    assert np.isin(np.abs(stored), 1.0).any() == noisy
+
+
+@pytest.mark.parametrize("n_envs", [1, 2])
+def test_random_actions_are_held(n_envs: int) -> None:
+    model = make_model(DummyVecEnv([CountingEnv] * n_envs), learning_starts=100, random_hold=4)
+    model.learn(24 * n_envs)
+    held = model.replay_buffer.actions[:24].reshape(6, 4, n_envs)
+    assert (held == held[:, :1]).all()
+    assert len(np.unique(held)) == 6 * n_envs
+    assert held.min() < -0.3 and held.max() > 0.3
+
+
+def test_memory_starts_afresh_with_each_episode(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = DummyVecEnv([lambda: CountingEnv(episode_length=5), lambda: CountingEnv(time_limit=3)])
+    model = make_model(env)
+    starts: list[list[bool]] = []
+    filter_ = model.policy.filter
+
+    def spy(observation: Any, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> LatentState:
+        starts.append(episode_start.tolist())
+        return filter_(observation, state, episode_start, deterministic)
+
+    monkeypatch.setattr(model.policy, "filter", spy)
+    model.learn(24)
+    assert [first for first, _ in starts] == [step % 5 == 0 for step in range(12)]
+    assert [second for _, second in starts] == [step % 3 == 0 for step in range(12)]
+    starts.clear()
+    model.learn(4, reset_num_timesteps=False)
+    assert starts == [[False, True], [False, False]]
+    model.learn(2)
+    assert starts[2:] == [[True, True]]
+
+
+def test_critics_are_asked_about_whole_episodes_where_they_start(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_model(DummyVecEnv([lambda: CountingEnv(episode_length=5)] * 2))
+    model.learn(40)
+    noted: list[int] = []
+    monkeypatch.setattr(model.penalty, "note_prediction", lambda values: noted.append(len(values)))
+    model.learn(20, reset_num_timesteps=False)
+    assert noted == [2, 0, 0, 0, 0] * 2
+
+
+def test_costs_of_episodes_are_logged() -> None:
+    model = make_model().learn(30)
+    assert model.ep_info_buffer is not None
+    assert [(info["l"], info["c"]) for info in model.ep_info_buffer] == [(7, 2.0)] * 4
+    model.dump_logs()
+    assert model.total_cost == 8.0
+    logged: dict[str, Any] = {}
+    model.logger.dump = lambda step=0: logged.update(model.logger.name_to_value)  # type: ignore[method-assign]
+    model.dump_logs()
+    assert logged["rollout/ep_cost_mean"] == 2.0
+    assert logged["rollout/total_cost"] == 8.0
+    assert logged["rollout/cost_rate"] == pytest.approx(8 / 30)
+
+
+def test_a_reset_from_outside_leaves_no_costs_behind() -> None:
+    """Learning anew resets the environment in the midst of an episode, whose costs must not be added to the next."""
+    model = make_model(learning_starts=0).learn(11)
+    model.learn(14)
+    assert model.ep_info_buffer is not None
+    assert [info["c"] for info in model.ep_info_buffer] == [2.0, 2.0]
+    assert model.total_cost == 4.0
+    assert model.penalty.episodes.costs[: model.penalty.episodes.size].tolist() == [2.0] * 3
+
+
+def test_learning_goes_on() -> None:
+    model = make_model().learn(30)
+    memory, buffered = model._last_latent, model.replay_buffer.size()
+    model.learn(30, reset_num_timesteps=False)
+    assert model.num_timesteps == 60 and model.replay_buffer.size() == buffered + 30
+    assert memory is not None and model._n_updates > 0
+    assert model.total_cost == 17.0
+
+
+def test_learn_has_a_default_number_of_steps() -> None:
+    assert inspect.signature(ESADLEND.learn).parameters["total_timesteps"].default == 100_000
+    steps: list[int] = []
+    make_model().learn(callback=lambda locals_, _: steps.append(1) or len(steps) < 5)
+    assert len(steps) == 5
+
+
+def test_learning_rate_schedule_reaches_every_optimiser() -> None:
+    model = make_model(learning_rate=lambda remaining: 1e-3 * remaining, ent_coef="auto").learn(40)
+    rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in model._optimizers().items()}
+    assert set(rates) == {*(f"policy.{name}.optimizer" for name in NETWORKS), "entropy.optimizer"}
+    assert len(set(rates.values())) == 1 and 0 < rates["entropy.optimizer"] < 1e-3
+
+
+@pytest.mark.parametrize(("ent_coef", "initial"), [("auto", 1.0), ("auto_0.01", 0.01), (0.3, 0.3)])
+def test_entropy_coefficient(ent_coef: str | float, initial: float) -> None:
+    model = make_model(ent_coef=ent_coef)
+    assert model.entropy().item() == pytest.approx(initial)
+    model.learn(40)
+    assert (model.entropy().item() == pytest.approx(initial, abs=1e-9)) == isinstance(ent_coef, float)
+
+
+def test_bound_of_the_cost_grows_where_costs_do_not_end_episodes() -> None:
+    model = make_model(cost_gamma=0.9).learn(30)
+    bounds = (model.policy.cost_critic.bound.item(), model.policy.cost_critic_target.bound.item())
+    assert bounds == pytest.approx((10.0, 10.0))
+    ending = make_model(DummyVecEnv([lambda: CountingEnv(episode_length=3)])).learn(30)
+    assert ending.policy.cost_critic.bound.item() == 1.0
+
+
+def test_barrier_looks_some_steps_ahead() -> None:
+    model = make_model(barrier_steps=2, barrier_decay=0.3, cost_limit=0.5)
+    risk = th.rand(5, 4)
+    barrier = model._barrier(risk)
+    th.testing.assert_close(barrier[:3], barrier_residual(risk[2:], risk[:3], model.penalty.budget, 0.3))
+    assert (barrier[3:] == 0).all()
+    assert (model._barrier(risk[:1]) == 0).all()
+
+
+@pytest.mark.parametrize("probability", [0.0, 1.0])
+def test_imagination_also_starts_with_random_actions(probability: float) -> None:
+    model = make_model(uniform_action_prob=probability)
+    start = model.policy.initial_state(2000)
+    th.manual_seed(1)
+    actions = model._first_actions(start)
+    assert actions.abs().max() <= 1.0
+    uniform = actions.abs().mean().item() == pytest.approx(0.5, abs=0.02)
+    th.manual_seed(1)
+    assert th.equal(actions, model.policy.actor(start.grid)) == (probability == 0.0)
+    assert uniform or probability == 0.0
+
+
+def test_recorded_transitions_lead_from_before_to_after() -> None:
+    """Two windows of three steps; a state is named after its window and step, the one that it leads to by 0.5 more."""
+    names = (10.0 * th.arange(2) + th.arange(3.0)[:, None])[..., None, None, None]
+    before, after = (LatentState(each, each, each[..., 0, 0]) for each in (names, names + 0.5))
+    gaussian = Gaussian(names, names)
+    filtered = Filtered(after, before, gaussian, gaussian, th.zeros(3, 2) > 0, th.zeros(3, 2) > 0)
+    batch_major = names[..., 0, 0, 0].T
+    samples = SimpleNamespace(
+        rewards=batch_major, costs=batch_major / 100, continues=batch_major / 10, event_weights=th.tensor([1.0, 2.0])
+    )
+    policy = SimpleNamespace(
+        world_model=SimpleNamespace(features=lambda state: state.grid), actor=lambda grid: 3 * grid[:, :1, 0, 0]
+    )
+    recorded = recorded_transitions(cast(LatentPolicy, policy), cast(SequenceSamples, samples), filtered)
+    now = recorded.grids[:, 0, 0, 0]
+    assert sorted(now.tolist()) == [0, 1, 2, 10, 11, 12]
+    th.testing.assert_close(recorded.actions[:, 0], now)
+    th.testing.assert_close(recorded.next_grids[:, 0, 0, 0], now + 0.5)
+    th.testing.assert_close(recorded.next_actions[:, 0], 3 * (now + 0.5))
+    th.testing.assert_close(recorded.outcomes.rewards, now)
+    th.testing.assert_close(recorded.outcomes.costs, now / 100)
+    th.testing.assert_close(recorded.outcomes.continues, now / 10)
+    th.testing.assert_close(recorded.event_weights, th.where(now < 10, 1.0, 2.0))
+
+
+def test_without_costs_the_multiplier_falls_and_with_them_it_rises() -> None:
+    multipliers = []
+    for env in (FreeEnv(), CountingEnv()):
+        model = make_model(env, cost_limit=0.5, penalty_warmup=0, lambda_lr=0.1, learning_starts=8)
+        assert isinstance(model.penalty, AugmentedLagrangian)
+        model.penalty.episodes.rate_steps = 20
+        model.learn(200)
+        multipliers.append(model.penalty.multiplier.item())
+    assert multipliers[0] < 0.9 < 1.1 < multipliers[1]
