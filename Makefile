@@ -25,9 +25,11 @@ format: $(INSTALLED)
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
-# The tables and figures of the paper.
+# What a step, an update and a decision take, as ratios within one run.
 benchmark: $(INSTALLED)
-	$(BIN)/python -m sb3_esad benchmark
+	$(BIN)/python benchmark/scenario_speed.py
+	$(BIN)/python benchmark/update_speed.py
+	$(BIN)/python benchmark/predict_latency.py
 
 $(INSTALLED): setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'

@@ -66,3 +66,47 @@ class CountingEnv(gym.Env):
 
     def _observe(self) -> Any:
         return np.array([self.start + self.count], dtype=np.float32)
+
+
+class RandomEnv(gym.Env):
+    """
+    Random observations of any space; a step costs with a chance of 1 in 5 and rewards the first entry of the action.
+
+    :param observation_space: what is observed
+    :param action_space: what is done
+    :param episode_length: steps until the time limit
+    """
+
+    def __init__(
+        self, observation_space: spaces.Space, action_space: spaces.Space = CountingEnv.action_space, episode_length: int = 9
+    ) -> None:
+        self.observation_space, self.action_space = observation_space, action_space
+        self.episode_length = episode_length
+        self.count = 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
+        super().reset(seed=seed)
+        if seed is not None:
+            self.observation_space.seed(seed)
+        self.count = 0
+        return self.observation_space.sample(), {}
+
+    def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+        assert self.action_space.contains(action), f"{action!r} is not in {self.action_space}"
+        self.count += 1
+        info = {"cost": float(self.np_random.random() < 0.2)}
+        return self.observation_space.sample(), float(np.ravel(action)[0]), False, self.count >= self.episode_length, info
+
+
+VIEWS = spaces.Dict(
+    {
+        "front": spaces.Box(0, 255, (3, 24, 20), np.uint8),
+        "map": spaces.Box(0, 255, (1, 16, 16), np.uint8),
+        "speed": spaces.Box(-np.inf, np.inf, (2,), np.float32),
+        "gear": spaces.Discrete(3),
+    }
+)
+PICTURE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
+VECTOR = spaces.Box(-1.0, 1.0, (3,), np.float32)
+SPACES: dict[str, spaces.Space] = {"MlpPolicy": VECTOR, "CnnPolicy": PICTURE, "MultiInputPolicy": VIEWS}
+"""An observation space for each policy."""

@@ -134,8 +134,8 @@ class KnownCostCritic(th.nn.Module):
     [
         ({"cost_limit": None}, 1.0),
         ({"cost_limit": 0.1, "risk_level": 1.0}, 0.25),  # a - 2 a^2
-        ({"cost_limit": 0.1, "risk_level": 0.5}, 0.0505),  # a - 2 (a^2 + 0.7979 a / 2)
-        ({"cost_limit": 0.1, "risk_level": 0.9}, 0.2220),  # a - 2 a^2 / 0.9 up to a = 0.88, for CVaR is at most E / alpha
+        ({"cost_limit": 0.1, "risk_level": 0.5}, 0.125),  # a - 2 a^2 / 0.5, for CVaR is at most E / alpha
+        ({"cost_limit": 0.1, "risk_level": 0.9}, 0.225),  # a - 2 a^2 / 0.9
     ],
 )
 def test_actor_finds_the_best_of_known_values(settings: dict[str, Any], best: float) -> None:
@@ -153,18 +153,16 @@ def test_actor_finds_the_best_of_known_values(settings: dict[str, Any], best: fl
 
 def actor_gradient(model: ESADLEND, imagined: Imagination) -> th.Tensor:
     """Gradient of the actor's loss; the policy stays as it is."""
-    state, moments = model.policy.actor.state_dict(), model.policy.actor.optimizer.state_dict()
-    saved = {name: value.clone() for name, value in state.items()}
+    saved = {name: value.clone() for name, value in model.policy.actor.state_dict().items()}
     th.manual_seed(0)
     model._update_actor(imagined)
     model.policy.actor.load_state_dict(saved)
-    model.policy.actor.optimizer.load_state_dict(moments)
     return th.cat([parameter.grad.flatten() for parameter in model.policy.actor.parameters() if parameter.grad is not None])
 
 
 @pytest.mark.parametrize("cost_limit", [None, 0.05])
 def test_without_a_limit_costs_do_not_reach_the_actor(cost_limit: float | None) -> None:
-    model = make_model(cost_limit=cost_limit).learn(24)
+    model = make_model(cost_limit=cost_limit, ent_coef=0.1).learn(24)
     _, _, imagined = imagine(model)
     before = actor_gradient(model, imagined)
     for parameter in model.policy.cost_critic.parameters():
@@ -188,7 +186,7 @@ def test_limits_choose_their_penalty() -> None:
 
 def test_budget_knows_the_time_limit() -> None:
     gym.register("limited-v0", CountingEnv, max_episode_steps=40)
-    model = ESADLEND("MlpPolicy", "limited-v0", cost_limit=0.05, cost_gamma=0.95, **TINY)
+    model = make_model(gym.make("limited-v0"), cost_limit=0.05, cost_gamma=0.95)
     assert model.penalty.budget == pytest.approx(0.0218, abs=1e-4)
 
 
@@ -216,9 +214,8 @@ def test_penalty_takes_part_whatever_callback_the_user_has() -> None:
 
 
 def test_a_violation_is_taken_once() -> None:
-    model = make_model(learning_starts=10).learn(13)
+    model = make_model(learning_starts=10).learn(12)
     assert model._n_updates == 1 and model.take_violation() is None, "the critics knew nothing when these steps were made"
-    model.learn(4, reset_num_timesteps=False)
     for _ in range(2):
         model._sample_action(0)
     violation = model.take_violation()
@@ -290,10 +287,10 @@ def test_memory_starts_afresh_with_each_episode(monkeypatch: pytest.MonkeyPatch)
     assert [first for first, _ in starts] == [step % 5 == 0 for step in range(12)]
     assert [second for _, second in starts] == [step % 3 == 0 for step in range(12)]
     starts.clear()
-    model.learn(4, reset_num_timesteps=False)
-    assert starts == [[False, True], [False, False]]
-    model.learn(2)
-    assert starts[2:] == [[True, True]]
+    model.learn(8, reset_num_timesteps=False)
+    assert starts == [[False, True], [False, False], [False, False], [True, True]]
+    model.learn(8)
+    assert starts[4:6] == [[True, True], [False, False]]
 
 
 def test_critics_are_asked_about_whole_episodes_where_they_start(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -301,28 +298,26 @@ def test_critics_are_asked_about_whole_episodes_where_they_start(monkeypatch: py
     model.learn(40)
     noted: list[int] = []
     monkeypatch.setattr(model.penalty, "note_prediction", lambda values: noted.append(len(values)))
-    model.learn(20, reset_num_timesteps=False)
-    assert noted == [2, 0, 0, 0, 0] * 2
+    model.learn(24, reset_num_timesteps=False)
+    assert noted == [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0]
 
 
 def test_costs_of_episodes_are_logged() -> None:
-    model = make_model().learn(30)
+    model = make_model().learn(28)
     assert model.ep_info_buffer is not None
     assert [(info["l"], info["c"]) for info in model.ep_info_buffer] == [(7, 2.0)] * 4
-    model.dump_logs()
-    assert model.total_cost == 8.0
     logged: dict[str, Any] = {}
     model.logger.dump = lambda step=0: logged.update(model.logger.name_to_value)  # type: ignore[method-assign]
     model.dump_logs()
     assert logged["rollout/ep_cost_mean"] == 2.0
     assert logged["rollout/total_cost"] == 8.0
-    assert logged["rollout/cost_rate"] == pytest.approx(8 / 30)
+    assert logged["rollout/cost_rate"] == pytest.approx(8 / 28)
 
 
 def test_a_reset_from_outside_leaves_no_costs_behind() -> None:
     """Learning anew resets the environment in the midst of an episode, whose costs must not be added to the next."""
-    model = make_model(learning_starts=0).learn(11)
-    model.learn(14)
+    model = make_model(learning_starts=0).learn(12)
+    model.learn(16)
     assert model.ep_info_buffer is not None
     assert [info["c"] for info in model.ep_info_buffer] == [2.0, 2.0]
     assert model.total_cost == 4.0
@@ -330,12 +325,10 @@ def test_a_reset_from_outside_leaves_no_costs_behind() -> None:
 
 
 def test_learning_goes_on() -> None:
-    model = make_model().learn(30)
-    memory, buffered = model._last_latent, model.replay_buffer.size()
-    model.learn(30, reset_num_timesteps=False)
-    assert model.num_timesteps == 60 and model.replay_buffer.size() == buffered + 30
-    assert memory is not None and model._n_updates > 0
-    assert model.total_cost == 17.0
+    model = make_model().learn(28)
+    model.learn(28, reset_num_timesteps=False)
+    assert model.num_timesteps == model.replay_buffer.size() == 56
+    assert model._n_updates == 9 and model.total_cost == 16.0
 
 
 def test_learn_has_a_default_number_of_steps() -> None:
@@ -346,10 +339,10 @@ def test_learn_has_a_default_number_of_steps() -> None:
 
 
 def test_learning_rate_schedule_reaches_every_optimiser() -> None:
-    model = make_model(learning_rate=lambda remaining: 1e-3 * remaining, ent_coef="auto").learn(40)
+    model = make_model(learning_rate=lambda remaining: 1e-3 * (0.1 + remaining), ent_coef="auto").learn(40)
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in model._optimizers().items()}
     assert set(rates) == {*(f"policy.{name}.optimizer" for name in NETWORKS), "entropy.optimizer"}
-    assert len(set(rates.values())) == 1 and 0 < rates["entropy.optimizer"] < 1e-3
+    assert list(rates.values()) == pytest.approx([1e-4] * 5)
 
 
 @pytest.mark.parametrize(("ent_coef", "initial"), [("auto", 1.0), ("auto_0.01", 0.01), (0.3, 0.3)])
@@ -357,7 +350,7 @@ def test_entropy_coefficient(ent_coef: str | float, initial: float) -> None:
     model = make_model(ent_coef=ent_coef)
     assert model.entropy().item() == pytest.approx(initial)
     model.learn(40)
-    assert (model.entropy().item() == pytest.approx(initial, abs=1e-9)) == isinstance(ent_coef, float)
+    assert (model.entropy().item() == pytest.approx(initial)) == isinstance(ent_coef, float)
 
 
 def test_bound_of_the_cost_grows_where_costs_do_not_end_episodes() -> None:
@@ -421,6 +414,6 @@ def test_without_costs_the_multiplier_falls_and_with_them_it_rises() -> None:
         model = make_model(env, cost_limit=0.5, penalty_warmup=0, lambda_lr=0.1, learning_starts=8)
         assert isinstance(model.penalty, AugmentedLagrangian)
         model.penalty.episodes.rate_steps = 20
-        model.learn(200)
+        model.learn(100)
         multipliers.append(model.penalty.multiplier.item())
     assert multipliers[0] < 0.9 < 1.1 < multipliers[1]

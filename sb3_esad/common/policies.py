@@ -119,8 +119,7 @@ class LatentPolicy(BasePolicy):
             extractor,
             rssm,
             normalize_images=self.normalize_images,
-            units=self.critic_arch[0],
-            **self.world_model_kwargs,
+            **{"units": self.critic_arch[0], **self.world_model_kwargs},
         )
 
     def initial_state(self, n_envs: int) -> LatentState:

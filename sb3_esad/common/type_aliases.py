@@ -99,3 +99,20 @@ class Imagination(NamedTuple):
     actions: th.Tensor
     predictions: Predictions
     weights: th.Tensor
+
+    def split(self, n: int) -> list["Imagination"]:
+        """
+        Deal the trajectories out into batches.
+
+        :param n: number of batches, at most N
+        :return: every n-th trajectory from the first on, from the second on, and so forth
+        """
+        return [
+            Imagination(
+                self.grids[:, k::n],
+                self.actions[:, k::n],
+                Predictions(*(f[:, k::n] for f in self.predictions)),
+                self.weights[:, k::n],
+            )
+            for k in range(n)
+        ]

@@ -58,6 +58,7 @@ class ESADLEND(LatentAlgorithm):
     :param replay_critic_coef: weight of recorded transitions in the loss of the reward critics
     :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics
     :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
+    :param behavior_batches: steps of actor and critics per update, each on its share of the imagined trajectories
     :param kwargs: see :class:`LatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
@@ -89,6 +90,7 @@ class ESADLEND(LatentAlgorithm):
         replay_critic_coef: float = 0.3,
         replay_cost_critic_coef: float = 1.0,
         uniform_action_prob: float = 0.3,
+        behavior_batches: int = 4,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
@@ -109,6 +111,7 @@ class ESADLEND(LatentAlgorithm):
         self.replay_critic_coef = replay_critic_coef
         self.replay_cost_critic_coef = replay_cost_critic_coef
         self.uniform_action_prob = uniform_action_prob
+        self.behavior_batches = behavior_batches
         if _init_setup_model:
             self._setup_model()
 
@@ -120,6 +123,7 @@ class ESADLEND(LatentAlgorithm):
         require(self.barrier_steps >= 1, "barrier_steps", self.barrier_steps, "a number of steps >= 1")
         uniform = self.uniform_action_prob
         require(0 <= uniform <= 1, "uniform_action_prob", uniform, "a probability in [0, 1]")
+        require(self.behavior_batches >= 1, "behavior_batches", self.behavior_batches, "a number of batches >= 1")
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -198,6 +202,12 @@ class ESADLEND(LatentAlgorithm):
 
     def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
         recorded = recorded_transitions(self.policy, samples, filtered)
+        n = min(self.behavior_batches, self.imagination_starts)
+        batches = zip(imagined.split(n), recorded.split(n), strict=True)
+        logs = [self._update_networks(*batch) for batch in batches]
+        return {name: float(np.mean([each[name] for each in logs])) for name in logs[0]}
+
+    def _update_networks(self, imagined: Imagination, recorded: Transitions) -> Logs:
         logs = {
             **self._update_critic(imagined, recorded),
             **self._update_cost_critic(imagined, recorded),
@@ -253,7 +263,7 @@ class ESADLEND(LatentAlgorithm):
         objective = self.entropy() * log_prob - value / self.policy.critic.scale
         loss = (imagined.weights.flatten() * self.penalty.combine(objective, risk, barrier.flatten())).mean()
         self._step(self.policy.actor, loss)
-        usual_risk = risk.detach()[: self.imagination_starts // 2].mean()
+        usual_risk = risk.detach()[: imagined.weights.shape[1] // 2].mean()
         return {
             "actor_loss": loss.item(),
             "cvar": usual_risk.item(),

@@ -34,6 +34,19 @@ class Transitions(NamedTuple):
     outcomes: Predictions
     event_weights: th.Tensor
 
+    def split(self, n: int) -> list["Transitions"]:
+        """
+        Deal the transitions out into batches.
+
+        :param n: number of batches
+        :return: every n-th transition from the first on, from the second on, and so forth
+        """
+        *tensors, outcomes, weights = self
+        return [
+            Transitions(*(each[k::n] for each in tensors), Predictions(*(each[k::n] for each in outcomes)), weights[k::n])
+            for k in range(n)
+        ]
+
 
 class CostTargets(NamedTuple):
     """
