@@ -75,6 +75,29 @@ def forget_gradients(model: ESADLEND) -> None:
         parameter.grad = None
 
 
+def test_behavior_learns_from_one_share_of_the_dreams_after_the_other() -> None:
+    model = make_model(behavior_batches=3).learn(24)
+    samples, filtered, imagined = imagine(model)
+    recorded = recorded_transitions(model.policy, samples, filtered)
+    whole = imagined.actions[:, :, 0].flatten().tolist(), recorded.actions.flatten().tolist()
+    parts = imagined.split(3), recorded.split(3)
+    shares = [each for part in parts[0] for each in part.actions[:, :, 0].flatten().tolist()]
+    assert sorted(shares) == sorted(whole[0]) and [part.weights.shape[1] for part in parts[0]] == [6, 5, 5]
+    assert sorted(each for part in parts[1] for each in part.actions.flatten().tolist()) == sorted(whole[1])
+    for part in parts[0]:
+        assert len(part.grids) == len(part.actions) == 4 and len(part.weights) == len(part.predictions.rewards) == 3
+    steps = model.policy.actor.optimizer.state_dict()["state"][0]["step"].item()
+    model._update_behavior(samples, filtered, imagined)
+    assert model.policy.actor.optimizer.state_dict()["state"][0]["step"] == steps + 3
+
+
+@pytest.mark.parametrize("settings", [{"batch_size": 1, "sequence_length": 1}, {"imagination_starts": 2}])
+def test_no_share_is_empty(settings: dict[str, int]) -> None:
+    model = make_model(behavior_batches=4, **settings).learn(32)
+    assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
+    assert np.isfinite(model.logger.name_to_value["train/cvar"])
+
+
 def test_each_update_moves_one_network() -> None:
     model = make_model().learn(24)
     samples, filtered, imagined = imagine(model)

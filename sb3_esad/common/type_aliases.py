@@ -6,6 +6,8 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import TensorDict
 
+from sb3_esad.common.torch_layers import join
+
 Logs = dict[str, float]
 
 NO_EVENT = 2**31 - 1
@@ -107,12 +109,9 @@ class Imagination(NamedTuple):
         :param n: number of batches, at most N
         :return: every n-th trajectory from the first on, from the second on, and so forth
         """
-        return [
-            Imagination(
-                self.grids[:, k::n],
-                self.actions[:, k::n],
-                Predictions(*(f[:, k::n] for f in self.predictions)),
-                self.weights[:, k::n],
-            )
-            for k in range(n)
-        ]
+        return [self._every(slice(k, None, n)) for k in range(n)]
+
+    def _every(self, some: slice) -> "Imagination":
+        grids = join([grid[some] for grid in self.grids])
+        predictions = Predictions(*(field[:, some] for field in self.predictions))
+        return Imagination(grids, self.actions[:, some], predictions, self.weights[:, some])

@@ -1,5 +1,6 @@
 """ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
 
+import math
 from typing import Any, ClassVar
 
 import numpy as np
@@ -202,7 +203,7 @@ class ESADLEND(LatentAlgorithm):
 
     def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
         recorded = recorded_transitions(self.policy, samples, filtered)
-        n = min(self.behavior_batches, self.imagination_starts)
+        n = min(self.behavior_batches, self.imagination_starts // 2, len(recorded.actions))
         batches = zip(imagined.split(n), recorded.split(n), strict=True)
         logs = [self._update_networks(*batch) for batch in batches]
         return {name: float(np.mean([each[name] for each in logs])) for name in logs[0]}
@@ -258,7 +259,9 @@ class ESADLEND(LatentAlgorithm):
         grids, _ = taken(imagined)
         actions, log_prob = self.policy.actor.action_log_prob(grids)
         value = self.policy.critic(grids, actions).min(0).values
-        risk = self.risk(grids, actions)
+        # Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
+        # from it to crash less often ("blindness to success", arXiv 2205.05138)
+        risk = self._unbounded_risk(grids, actions)
         barrier = self._barrier(risk.detach().view_as(imagined.weights))
         objective = self.entropy() * log_prob - value / self.policy.critic.scale
         loss = (imagined.weights.flatten() * self.penalty.combine(objective, risk, barrier.flatten())).mean()
@@ -281,8 +284,11 @@ class ESADLEND(LatentAlgorithm):
         :param actions: their actions, of shape (N, A)
         :return: shape (N,)
         """
+        return self._unbounded_risk(grids, actions).clamp(max=self.policy.cost_critic.bound)
+
+    def _unbounded_risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         means, variance = self.policy.cost_critic(grids, actions)
-        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic.bound).max(0).values
+        return capped_cvar(means, variance, self.risk_level, math.inf).max(0).values
 
     def _barrier(self, risk: th.Tensor) -> th.Tensor:
         """Residual at each imagined step, of shape (H, N); the last m steps look too far ahead and count as safe."""

@@ -41,11 +41,12 @@ class Transitions(NamedTuple):
         :param n: number of batches
         :return: every n-th transition from the first on, from the second on, and so forth
         """
-        *tensors, outcomes, weights = self
-        return [
-            Transitions(*(each[k::n] for each in tensors), Predictions(*(each[k::n] for each in outcomes)), weights[k::n])
-            for k in range(n)
-        ]
+        return [self._every(slice(k, None, n)) for k in range(n)]
+
+    def _every(self, some: slice) -> "Transitions":
+        grids, actions, next_grids, next_actions = (field[some] for field in self[:4])
+        outcomes = Predictions(*(field[some] for field in self.outcomes))
+        return Transitions(grids, actions, next_grids, next_actions, outcomes, self.event_weights[some])
 
 
 class CostTargets(NamedTuple):
