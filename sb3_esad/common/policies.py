@@ -31,7 +31,7 @@ class LatentPolicy(BasePolicy):
     :param action_space: box of the actions
     :param lr_schedule: learning rate of all networks
     :param net_arch: hidden layers of actor and critics, or of each in a dictionary with ``pi`` and ``qf``; at least one
-    :param memory_channels: channels of the memory in each cell; None for 48 on a grid and 256 for vectors
+    :param memory_channels: channels of the memory in each cell; None for 32 on a grid and 256 for vectors
     :param latent_channels: channels of the stochastic latent in each cell; None for 8 on a grid and 32 for vectors
     :param world_model_kwargs: further arguments of the world model
     :param head_kwargs: further arguments of the latent head
@@ -108,7 +108,7 @@ class LatentPolicy(BasePolicy):
         extractor = self.make_features_extractor()
         embedding_channels, height, width = grid_shape(extractor)
         spatial = height * width > 1
-        memory_shape = (self.memory_channels or (48 if spatial else 256), height, width)
+        memory_shape = (self.memory_channels or (32 if spatial else 256), height, width)
         latent_channels = self.latent_channels or (8 if spatial else 32)
         head = self.head_class(
             memory_shape, embedding_channels, latent_channels, hidden_channels=memory_shape[0], **self.head_kwargs
@@ -144,8 +144,7 @@ class LatentPolicy(BasePolicy):
         :param deterministic: take the mean of the latent instead of a sample
         :return: the present state
         """
-        keep = ~episode_start
-        kept = state.map(lambda field: field * keep.view(-1, *[1] * (field.dim() - 1)))
+        kept = state.map(lambda field: field.masked_fill(episode_start.view(-1, *[1] * (field.dim() - 1)), 0.0))
         with autocast(self.device):
             return self.world_model.filter(kept, observation, deterministic)
 
