@@ -292,12 +292,16 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         assert self._last_obs is not None and self._last_episode_starts is not None
         if self._last_episode_starts.all():
             self._episode_costs.clear()
-        images = self.policy.world_model.images(self._last_obs)
-        blank = {key: batch.flat[0] for key, batch in images.items() if np.max(batch) == np.min(batch)}
-        remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
-        for key, value in blank.items():
-            raise ValueError(f"Every pixel of the first image '{key}' is {value}, nothing can be learned from it: {remedy}.")
+        self._refuse_blank_images(self._last_obs)
         return result
+
+    def _refuse_blank_images(self, observations: np.ndarray | dict[str, np.ndarray]) -> None:
+        remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
+        for key, images in self.policy.world_model.images(observations).items():
+            for image in images:
+                if np.max(image) == np.min(image):
+                    reason = f"Every pixel of the first image '{key}' is {np.max(image)}, nothing can be learned from it"
+                    raise ValueError(f"{reason}: {remedy}.")
 
     def train(self, gradient_steps: int, batch_size: int = 16) -> None:
         """

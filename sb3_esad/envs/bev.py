@@ -18,6 +18,7 @@ SUBPIXEL_BITS = 4
 BLEED = 0.7 * 2**SUBPIXEL_BITS  # measured: a filled shape comes out this much larger on every side [px / 16]
 STANDING_GREY, USER_SPAN, EGO_SPAN, OBSTACLE_GREY = 95, 160, 100, 255
 TOP_SPEED = 40.0  # the speed of the brightest grey level [m/s]
+DIAL_SPEED, DIAL_GREY = 32.0, 160  # the speed at which the dial is as high as the image [m/s]
 OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
 
 
@@ -112,12 +113,28 @@ def user_greys(traffic: Traffic) -> list[int]:
     return np.rint(grey).astype(int).tolist()
 
 
+def draw_dial(image: Image, speed: float) -> None:
+    """
+    Show a speed as the height of a bar at either edge, to a fraction of a pixel.
+
+    Grey levels alone are too faint for this: an agent that learns to see by squared error would take notice of its own speed
+    only after it has learned everything else, and until then believe that braking changes nothing.
+
+    :param image: drawn into, shape ``(rows, columns)``
+    :param speed: [m/s]
+    """
+    height = min(speed / DIAL_SPEED, 1.0) * image.shape[0]
+    filled = np.clip(height - np.arange(image.shape[0])[::-1], 0.0, 1.0)
+    image[:, [0, -1]] = np.rint(DIAL_GREY * filled).astype(np.uint8)[:, None]
+
+
 class BirdsEyeView:
     """
     The image an agent sees, channel first; a mirrored world gives the mirrored image.
 
     Channel 0 is the road: surface, brighter where the route leads, and painted lines. Channel 1 holds the moving users,
-    brighter the faster they are. Channel 2 holds the ego vehicle, brightened likewise, and at 255 what must not be hit.
+    brighter the faster they are. Channel 2 holds the ego vehicle, brightened likewise, its speed as a dial at both edges, and at
+    255 what must not be hit.
 
     :param view: size and scale of the image
     """
@@ -147,4 +164,5 @@ class BirdsEyeView:
         view.fill(layers, np.concatenate([asphalt, boxes]), greys)
         paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
         view.lines(road, view.pixels(markings.lines, origin, heading), paint)
+        draw_dial(obstacles, float(traffic.speed[EGO]))
         return image
