@@ -133,8 +133,8 @@ class BirdsEyeView:
     The image an agent sees, channel first; a mirrored world gives the mirrored image.
 
     Channel 0 is the road: surface, brighter where the route leads, and painted lines. Channel 1 holds the moving users,
-    brighter the faster they are. Channel 2 holds the ego vehicle, brightened likewise, its speed as a dial at both edges, and at
-    255 what must not be hit.
+    brighter the faster they are. Channel 2 holds the ego vehicle, brightened likewise, its speed as a dial at both edges, and
+    what must not be hit at 255.
 
     :param view: size and scale of the image
     """
