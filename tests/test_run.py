@@ -113,7 +113,7 @@ def test_action_spaces(space: spaces.Box, n_envs: int) -> None:
         {"replay_buffer_kwargs": {"event_fraction": 0.0}},
         {"action_noise": OrnsteinUhlenbeckActionNoise(np.zeros(1), np.ones(1))},
     ],
-    ids=str,
+    ids=lambda settings: "-".join(settings),  # not their values: a function's address differs between the workers
 )
 def test_settings(settings: dict[str, Any]) -> None:
     learn("MlpPolicy", CountingEnv(), **settings)
