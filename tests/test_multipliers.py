@@ -14,7 +14,7 @@ from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
 
 
 def make_penalty(**kwargs: Any) -> AugmentedLagrangian:
-    defaults: dict[str, Any] = {"cost_limit": 1.0, "cost_gamma": 1.0, "risk_level": 1.0, "penalty_warmup": 0}
+    defaults = {"cost_limit": 1.0, "cost_gamma": 1.0, "risk_level": 1.0, "penalty_warmup": 0, "road_steps": 10}
     return AugmentedLagrangian(**{**defaults, **kwargs})
 
 
@@ -172,13 +172,13 @@ def test_uncalibrated_critics_have_no_vote() -> None:
 
 
 def test_few_episodes_have_no_vote() -> None:
-    penalty = make_penalty()
+    penalty = make_penalty(road_steps=100)
     observe_episodes(penalty, cost=9.0, n=19)
     penalty.note_prediction(th.tensor([9.0]))
     assert not penalty.calibrated
     assert "violation_road" not in penalty.update(1.0)
     assert penalty.multiplier.item() == 1.0 and penalty.mean_violation.item() == 0.0
-    observe_episodes(penalty, cost=9.0, n=1)
+    observe_episodes(penalty, cost=9.0, n=10)
     assert penalty.update(1.0)["violation_road"] == 1.0
 
 
@@ -194,16 +194,36 @@ def test_warm_up_and_missing_updates_hold_the_multiplier() -> None:
     assert penalty.multiplier.item() > 1.0
 
 
-def test_road_signal_is_the_tail_of_the_latest_episodes() -> None:
+def drive(record: EpisodeRecord, costs: list[float], done_every: int) -> None:
+    """Observe one cost after another in one environment."""
+    for step, cost in enumerate(costs, start=1):
+        record.observe(np.array([cost]), np.array([step % done_every == 0]))
+
+
+def test_road_signal_is_the_present_rate_over_an_episode_of_full_length() -> None:
+    record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50, road_steps=500)
+    drive(record, [0.0, 0.0, 0.0, 0.0, 1.0] * 40, done_every=5)
+    assert record.expected_cost == pytest.approx(2.0, rel=0.02)
+    assert record.tail_cost(0.5) == pytest.approx(record.expected_cost)  # all episodes alike: no tail
+    drive(record, [0.0] * 20, done_every=20)
+    assert record.episode_length == 20  # of the cost-free episodes, crashes do not shorten it
+    before = record.cost_rate.item()
+    drive(record, [0.0] * 1000, done_every=20)
+    assert record.cost_rate.item() == pytest.approx(before * (1 - 1 / 500) ** 1000, rel=1e-3)
+
+
+def test_road_signal_of_rare_crashes_is_their_share_over_the_risk_level() -> None:
+    record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50, road_steps=10_000)
+    drive(record, ([0.0] * 490 + [0.0] * 9 + [1.0]) * 10, done_every=10)
+    assert record.tail_cost(1.0) == pytest.approx(0.02, rel=0.1)
+    assert record.tail_cost(0.5) == pytest.approx(0.04, rel=0.1)
+
+
+def test_calibration_compares_the_start_of_episodes() -> None:
     record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50)
-    for cost in [100.0] * 30 + [float(c) for c in range(50)]:
-        record.observe(np.array([0.0, 0.0]), np.array([False, False]))
-        record.observe(np.array([cost, 0.0]), np.array([True, False]))
-    assert record.size == 50
-    assert record.tail_cost(1.0) == pytest.approx(24.5)
-    assert record.tail_cost(0.1) == pytest.approx(np.mean([45, 46, 47, 48, 49]))
+    drive(record, [0.0, 1.0] * 50, done_every=2)
     assert record.calibration(1e-9) == pytest.approx(0.0, abs=1e-6)
-    record.note_prediction(th.tensor([12.25]))
+    record.note_prediction(th.tensor([0.5]))
     assert record.calibration(1e-9) == pytest.approx(1.0, rel=1e-4)
 
 

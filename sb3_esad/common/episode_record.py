@@ -17,6 +17,7 @@ class EpisodeRecord(nn.Module):
     :param cost_gamma: discount of the costs
     :param episode_length: in steps, assumed until cost-free episodes have been seen
     :param window: number of episodes remembered
+    :param road_steps: steps over which the present cost rate is averaged
     """
 
     costs: th.Tensor
@@ -31,11 +32,11 @@ class EpisodeRecord(nn.Module):
     rate_weight: th.Tensor
 
     prediction_decay = 0.99
-    rate_steps = 2000
 
-    def __init__(self, cost_gamma: float, episode_length: float, window: int) -> None:
+    def __init__(self, cost_gamma: float, episode_length: float, window: int, road_steps: int = 2000) -> None:
         super().__init__()
         self.window = window
+        self.road_steps = road_steps
         self._under_way = EpisodeCosts(cost_gamma)  # not saved: another number of environments may follow
         self.register_buffer("costs", th.zeros(window))
         self.register_buffer("discounted_costs", th.zeros(window))
@@ -64,7 +65,7 @@ class EpisodeRecord(nn.Module):
         :param costs: (n_envs,)
         :param dones: (n_envs,)
         """
-        share = min(len(costs) / self.rate_steps, 1.0)
+        share = min(len(costs) / self.road_steps, 1.0)
         self.cost_rate += share * (float(np.mean(costs)) - self.cost_rate)
         self.rate_weight += share * (1.0 - self.rate_weight)
         for episode in self._under_way.add(costs, dones):

@@ -155,7 +155,8 @@ class AugmentedLagrangian(Penalty):
     :param penalty_coef: rho >= 0, the proportional gain; 0 is the plain Lagrangian
     :param penalty_warmup: updates during which the multiplier holds still
     :param window: episodes remembered
-    :param min_episodes: finished episodes without which neither signal is trusted
+    :param road_steps: steps over which the present cost rate is averaged
+    :param min_episodes: finished episodes without which the critics are not trusted
     :param calibration_band: predicted over observed cost within which the critics are trusted
     :raises ValueError: if an argument is out of its range
     """
@@ -178,6 +179,7 @@ class AugmentedLagrangian(Penalty):
         penalty_coef: float = 1.0,
         penalty_warmup: int = 1000,
         window: int = 50,
+        road_steps: int = 2000,
         min_episodes: int = 20,
         calibration_band: tuple[float, float] = (1 / 3, 3.0),
     ) -> None:
@@ -202,7 +204,7 @@ class AugmentedLagrangian(Penalty):
         self.penalty_warmup = penalty_warmup
         self.min_episodes = min(min_episodes, window)
         self.calibration_band = calibration_band
-        self.episodes = EpisodeRecord(cost_gamma, episode_length, window)
+        self.episodes = EpisodeRecord(cost_gamma, episode_length, window, road_steps)
         self.register_buffer("multiplier", th.tensor(float(multiplier_init)))
         self.register_buffer("mean_violation", th.zeros(()))
         self.register_buffer("n_updates", th.zeros(()))
