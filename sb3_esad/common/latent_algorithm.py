@@ -112,7 +112,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         imagination_horizon: int = 10,
         imagination_starts: int = 128,
         lambda_return: float = 0.95,
-        random_hold: int = 5,
+        random_hold: int = 3,
         max_grad_norm: float = 100.0,
         cost_key: str = "cost",
         policy_kwargs: dict[str, Any] | None = None,
@@ -225,9 +225,8 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:
             actions = np.stack([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(actions).reshape(n_envs, -1)
-            # Each component with an amplitude of its own: a full stroke of one would else hide what the others do, as steering
-            # ends an episode before the brakes have shown an effect
-            self._random_actions = (np.random.rand(*scaled.shape) * scaled).astype(np.float32)
+            # With a random amplitude: full strokes alone would end every episode within seconds and show little of the world
+            self._random_actions = (np.random.rand(n_envs, 1) * scaled).astype(np.float32)
         return self._random_actions
 
     def _store_transition(

@@ -78,7 +78,7 @@ class ESADLEND(LatentAlgorithm):
         cost_limit: float | None = 0.05,
         risk_level: float = 0.5,
         cost_gamma: float | None = None,
-        ent_coef: str | float = "auto_0.02",
+        ent_coef: str | float = "auto_0.03",
         target_entropy: str | float = "auto",
         lagrangian_multiplier_init: float = 1.0,
         lambda_lr: float = 0.003,
@@ -91,7 +91,7 @@ class ESADLEND(LatentAlgorithm):
         replay_critic_coef: float = 0.3,
         replay_cost_critic_coef: float = 1.0,
         uniform_action_prob: float = 0.3,
-        behavior_batches: int = 4,
+        behavior_batches: int = 1,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
