@@ -16,7 +16,8 @@ def run(policy: str, seed: int, **kwargs: Any) -> tuple[list[np.ndarray], np.nda
     env = make_vec_env(RandomEnv, 2, seed=seed, env_kwargs={"observation_space": SPACES[policy]})
     model = ESADLEND(policy, env, **{**TINY, "seed": seed, **kwargs}).learn(48)
     env.seed(seed)
-    observation, state, actions, rewards = env.reset(), None, [], []
+    observation: Any = env.reset()
+    state, actions, rewards = None, [], []
     for step in range(10):
         action, state = model.predict(observation, state, deterministic=step % 2 == 0)
         observation, reward, _, _ = env.step(action)

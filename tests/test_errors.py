@@ -37,8 +37,8 @@ class CostlyEnv(CountingEnv):
         self.info = info
 
     def step(self, action: np.ndarray) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        *outcome, _ = super().step(action)
-        return (*outcome, dict(self.info))  # type: ignore[return-value]
+        obs, reward, terminated, truncated, _ = super().step(action)
+        return obs, reward, terminated, truncated, dict(self.info)
 
 
 @pytest.mark.parametrize("cost", [float("nan"), float("inf"), -0.1, [0.0, 1.0], np.zeros(1), "much", None])

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.envs.registration import EnvSpec
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -39,7 +40,7 @@ class FreeEnv(CountingEnv):
 class RecordingEnv(CountingEnv):
     """Remembers the actions it was given."""
 
-    action_space = spaces.Box(np.float32([-3.0, 0.0]), np.float32([5.0, 1.0]))
+    action_space = spaces.Box(np.array([-3.0, 0.0], np.float32), np.array([5.0, 1.0], np.float32))
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -92,7 +93,7 @@ def test_behavior_learns_from_one_share_of_the_dreams_after_the_other() -> None:
 
 
 @pytest.mark.parametrize("settings", [{"batch_size": 1, "sequence_length": 1}, {"imagination_starts": 2}])
-def test_no_share_is_empty(settings: dict[str, int]) -> None:
+def test_no_share_is_empty(settings: dict[str, Any]) -> None:
     model = make_model(behavior_batches=4, **settings).learn(32)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     assert np.isfinite(model.logger.name_to_value["train/cvar"])
@@ -208,8 +209,9 @@ def test_limits_choose_their_penalty() -> None:
 
 
 def test_budget_knows_the_time_limit() -> None:
-    gym.register("limited-v0", CountingEnv, max_episode_steps=40)
-    model = make_model(gym.make("limited-v0"), cost_limit=0.05, cost_gamma=0.95)
+    env = CountingEnv()
+    env.spec = EnvSpec("limited-v0", max_episode_steps=40)
+    model = make_model(env, cost_limit=0.05, cost_gamma=0.95)
     assert model.penalty.budget == pytest.approx(0.0218, abs=1e-4)
 
 
@@ -231,6 +233,7 @@ def test_penalty_takes_part_whatever_callback_the_user_has() -> None:
     choices: list[MaybeCallback] = [None, mine, [CountCalls(), CountCalls()], function]
     for callback in choices:
         model = make_model().learn(40, callback=callback)
+        assert isinstance(model.penalty, AugmentedLagrangian)
         assert model.penalty.n_updates.item() == model._n_updates - 1, "the last update is followed by no rollout"
         assert "train/lagrangian_multiplier" in model.logger.name_to_value
     assert mine.n_calls == len(calls) == 40
@@ -257,7 +260,12 @@ def test_pretraining_comes_once(monkeypatch: pytest.MonkeyPatch) -> None:
     model = make_model(pretrain_steps=5, learning_starts=8)
     updates: list[int] = []
     fit = model._update_world_model
-    monkeypatch.setattr(model, "_update_world_model", lambda samples: updates.append(model._n_updates) or fit(samples))
+
+    def spy(samples: SequenceSamples) -> Any:
+        updates.append(model._n_updates)
+        return fit(samples)
+
+    monkeypatch.setattr(model, "_update_world_model", spy)
     model.learn(20)
     assert updates == [0] * 6 + [1, 2]
 
@@ -344,6 +352,7 @@ def test_a_reset_from_outside_leaves_no_costs_behind() -> None:
     assert model.ep_info_buffer is not None
     assert [info["c"] for info in model.ep_info_buffer] == [2.0, 2.0]
     assert model.total_cost == 4.0
+    assert isinstance(model.penalty, AugmentedLagrangian)
     assert model.penalty.episodes.costs[: model.penalty.episodes.size].tolist() == [2.0] * 3
 
 
@@ -356,9 +365,9 @@ def test_learning_goes_on() -> None:
 
 def test_learn_has_a_default_number_of_steps() -> None:
     assert inspect.signature(ESADLEND.learn).parameters["total_timesteps"].default == 100_000
-    steps: list[int] = []
-    make_model().learn(callback=lambda locals_, _: steps.append(1) or len(steps) < 5)
-    assert len(steps) == 5
+    model = make_model()
+    model.learn(callback=lambda locals_, _: model.num_timesteps < 5)
+    assert model.num_timesteps == 5 and model._total_timesteps == 100_000
 
 
 def test_learning_rate_schedule_reaches_every_optimiser() -> None:

@@ -24,7 +24,8 @@ def make_model(policy: str, **kwargs: Any) -> ESADLEND:
 
 def excite(model: ESADLEND) -> None:
     """Untrained actors do the same whatever they see; let this one act by what it sees."""
-    th.nn.init.normal_(model.policy.actor.mean_log_std_net[-1].weight)  # type: ignore[arg-type]
+    *_, output_weight, _ = model.policy.actor.parameters()
+    th.nn.init.normal_(output_weight)
 
 
 def observe(model: ESADLEND, n_envs: int, steps: int) -> list[Observation]:
@@ -50,14 +51,15 @@ def test_together_is_one_by_one(policy: str, float32: None) -> None:
     model = make_model(policy)
     observations = observe(model, n_envs=3, steps=4)
     starts = np.array([[True, True, True], [False, True, False], [False, False, True], [False, False, False]])
-    state, alone = None, [None] * 3
+    state: Any = None
+    alone: list[Any] = [None] * 3
     for observation, start in zip(observations, starts, strict=True):
         actions, state = model.predict(observation, state, start, deterministic=True)
         for env in range(3):
             one = slice(env, env + 1)
             action, alone[env] = model.predict(pick(observation, one), alone[env], start[one], deterministic=True)
             np.testing.assert_allclose(action[0], actions[env], atol=1e-5)
-            for single, joint in zip(alone[env], state, strict=True):  # type: ignore[call-overload]
+            for single, joint in zip(alone[env], state, strict=True):
                 np.testing.assert_allclose(single[:, 0], joint[:, env], atol=1e-5)
 
 
@@ -131,7 +133,8 @@ def test_predicting_is_acting() -> None:
         excite(model)
         th.manual_seed(3)
         if through_predict:
-            observation, state, start, done = env.reset(), None, np.ones(1, dtype=bool), []
+            observation: Any = env.reset()
+            state, start, done = None, np.ones(1, dtype=bool), []
             for _ in range(20):
                 action, state = model.predict(observation, state, start)
                 observation, _, start, _ = env.step(action)
@@ -184,13 +187,16 @@ def test_images_as_the_environment_shows_them(channel_first: bool) -> None:
     assert model.observation_space.shape == (3, 40, 36)
     shown, _ = env.reset()
     transposed = shown if channel_first else shown.transpose(2, 0, 1)
-    np.testing.assert_array_equal(*(model.predict(image, deterministic=True)[0] for image in (shown, transposed)))
+    one, other = (model.predict(image, deterministic=True)[0] for image in (shown, transposed))
+    np.testing.assert_array_equal(one, other)
 
 
 def test_actions_are_in_the_units_of_the_environment() -> None:
-    space = spaces.Box(np.float32([[-3.0, 0.0], [10.0, -1.0]]), np.float32([[5.0, 0.1], [20.0, 1.0]]))
+    low, high = np.array([[-3, 0], [10, -1]], np.float32), np.array([[5, 0.1], [20, 1]], np.float32)
+    space = spaces.Box(low, high)
     model = ESADLEND("MlpPolicy", RandomEnv(VECTOR, space), **TINY)
-    model.policy.actor.mean_log_std_net[-1].bias.data[:4] = th.tensor([9.0, -9.0, 0.0, 9.0])  # type: ignore[union-attr,index]
+    *_, output_bias = model.policy.actor.parameters()
+    output_bias.data[:4] = th.tensor([9.0, -9.0, 0.0, 9.0])
     action, _ = model.predict(VECTOR.sample(), deterministic=True)
     np.testing.assert_allclose(action, [[5.0, 0.0], [15.0, 1.0]], atol=1e-4)
     assert action.dtype == np.float32

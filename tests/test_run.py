@@ -81,7 +81,7 @@ def test_observation_spaces(space: spaces.Space) -> None:
     "space",
     [
         spaces.Box(-2.0, 3.0, (2, 2), np.float32),
-        spaces.Box(np.float32([0.0, -7.0]), np.float32([0.1, -5.0])),
+        spaces.Box(np.array([0.0, -7.0], np.float32), np.array([0.1, -5.0], np.float32)),
         spaces.Box(-1.0, 1.0, (3,), np.float64),
     ],
     ids=str,
@@ -139,7 +139,8 @@ def test_policy_settings(policy_kwargs: dict[str, Any]) -> None:
 def test_architecture_of_actor_and_critics() -> None:
     model = ESADLEND("MlpPolicy", CountingEnv(), **{**TINY, "policy_kwargs": {"net_arch": {"pi": [8], "qf": [16, 4]}}})
     assert model.policy.actor.readout.features_dim == 8
-    widths = [layer.out_features for layer in model.policy.critic.q_networks[0] if isinstance(layer, th.nn.Linear)]
+    layers = model.policy.critic.q_networks[0].modules()
+    widths = [layer.out_features for layer in layers if isinstance(layer, th.nn.Linear)]
     assert model.policy.critic.features.readout.features_dim == 16 and widths == [16, 4, 101]
 
 
@@ -147,7 +148,7 @@ def test_normalised_environment() -> None:
     env = VecNormalize(DummyVecEnv([lambda: CountingEnv()] * 2))
     model = learn("MlpPolicy", env)
     stored = model.replay_buffer
-    assert stored.observations[: stored.size()].max() == 6  # type: ignore[call-overload]
+    assert np.max(stored.observations) == 6  # type: ignore[arg-type]
     assert set(np.unique(stored.rewards[: stored.size()])) == {1, 2, 3, 4, 5, 6, 7}
     samples = model._sample(4)
     assert samples.observations.abs().max() < 6  # type: ignore[union-attr]
@@ -187,9 +188,8 @@ def test_evaluation_beside_training() -> None:
         callback = EvalCallback(eval_env, eval_freq=10 if evaluations else 0, n_eval_episodes=3, verbose=0)
         model.learn(20, callback=callback)
         assert len(callback.evaluations_results) == 0 and (callback.last_mean_reward == 28.0) == (evaluations > 0)
-        assert model._last_latent is not None
+        assert model._last_latent is not None and len(model._last_latent.memory) == 1
         memories.append([model._last_latent.action, th.as_tensor(model._last_obs)])
-    assert model._last_latent.memory.shape[0] == 1
     for one, other in zip(*memories, strict=True):
         th.testing.assert_close(one, other)
 
@@ -198,8 +198,7 @@ def test_evaluate_policy_of_sb3() -> None:
     model = ESADLEND("MlpPolicy", CountingEnv(), **TINY)
     assert evaluate_policy(model, Monitor(CountingEnv()), n_eval_episodes=3) == (28.0, 0.0)
     env = DummyVecEnv([lambda: Monitor(CountingEnv(episode_length=3)), lambda: Monitor(CountingEnv())])
-    rewards, lengths = evaluate_policy(model, env, n_eval_episodes=4, return_episode_rewards=True)
-    assert sorted(zip(rewards, lengths, strict=True)) in ([(6, 3), (6, 3), (28, 7), (28, 7)], [(28, 7)] * 4)  # type: ignore[arg-type]
+    assert evaluate_policy(model, env, n_eval_episodes=4) == (17.0, 11.0), "as many episodes of either length"
 
 
 def test_callbacks_can_stop() -> None:

@@ -12,12 +12,18 @@ from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_esad import ESADLEND
+from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.policies import LatentPolicy
 from tests.conftest import PICTURE, SPACES, TINY, VECTOR, CountingEnv, RandomEnv
 
 
 def make_env(policy: str, n_envs: int = 1) -> DummyVecEnv:
     return DummyVecEnv([lambda: RandomEnv(SPACES[policy])] * n_envs)
+
+
+def multiplier_of(model: ESADLEND) -> th.Tensor:
+    assert isinstance(model.penalty, AugmentedLagrangian)
+    return model.penalty.multiplier
 
 
 def train(policy: str = "MlpPolicy", n_envs: int = 1, steps: int = 32, **kwargs: Any) -> ESADLEND:
@@ -52,14 +58,14 @@ def assert_same(one: Any, other: Any) -> None:
 def test_everything_comes_back(policy: str, tmp_path: Path) -> None:
     """Parameters, optimisers, multiplier, entropy coefficient, return scale and image background."""
     model = train(policy, ent_coef="auto")
-    model.penalty.multiplier.fill_(7.0)
+    multiplier_of(model).fill_(7.0)
     model.policy.critic.scale.fill_(3.0)
     model.save(tmp_path / "model")
     loaded = ESADLEND.load(tmp_path / "model", device="cpu")
     saved, restored = model.get_parameters(), loaded.get_parameters()
     assert {"policy", "penalty", "entropy", "entropy.optimizer", "policy.world_model.optimizer"} <= saved.keys()
     assert_same(saved, restored)
-    assert loaded.penalty.multiplier.item() == 7.0 and loaded.policy.critic.scale.item() == 3.0
+    assert multiplier_of(loaded).item() == 7.0 and loaded.policy.critic.scale.item() == 3.0
     assert loaded.entropy().item() == model.entropy().item() != 1.0
     assert loaded.num_timesteps == 32 and loaded._n_updates == model._n_updates
     if policy == "CnnPolicy":
@@ -88,10 +94,10 @@ def test_training_goes_on(ent_coef: str | float, tmp_path: Path) -> None:
     model = train(ent_coef=ent_coef)
     model.save(tmp_path / "model")
     loaded = ESADLEND.load(tmp_path / "model", env=make_env("MlpPolicy"), device="cpu")
-    multiplier = loaded.penalty
+    penalty = loaded.penalty
     loaded.learn(24, reset_num_timesteps=False)
     assert loaded.num_timesteps == 56 and loaded._n_updates == model._n_updates + 6
-    assert loaded.penalty is multiplier and loaded.replay_buffer.size() == 24
+    assert loaded.penalty is penalty and loaded.replay_buffer.size() == 24
     assert all(parameter.isfinite().all() for parameter in loaded.policy.parameters())
 
 
@@ -126,7 +132,7 @@ def test_arguments_survive(tmp_path: Path) -> None:
     model.save(tmp_path / "model")
     loaded = ESADLEND.load(tmp_path / "model", device="cpu")
     assert {name: getattr(loaded, name) for name in settings} == settings
-    assert loaded.penalty.cost_limit == 0.3 and loaded.penalty.multiplier.item() == 2.0
+    assert loaded.penalty.cost_limit == 0.3 and multiplier_of(loaded).item() == 2.0
     assert loaded.entropy().item() == pytest.approx(0.2)
     assert loaded.replay_buffer.sequence_length == 8 and loaded.replay_buffer.read_costs.cost_key == "crashed"
     assert loaded.replay_cost_critic_coef == 0.7
@@ -238,12 +244,12 @@ def test_a_saved_image_buffer_is_no_larger_than_its_frames(tmp_path: Path) -> No
 def test_set_parameters() -> None:
     model, other = train(), train(seed=1)
     assert not np.allclose(actions_of(model), actions_of(other))
-    other.set_parameters(model.get_parameters(), exact_match=True)
+    parameters: dict[str, Any] = model.get_parameters()
+    other.set_parameters(parameters, exact_match=True)
     np.testing.assert_array_equal(actions_of(other), actions_of(model))
-    incomplete = model.get_parameters()
-    del incomplete["penalty"]
+    del parameters["penalty"]
     with pytest.raises(ValueError, match="do not match"):
-        other.set_parameters(incomplete, exact_match=True)
+        other.set_parameters(parameters, exact_match=True)
 
 
 def test_another_environment() -> None:

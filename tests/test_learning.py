@@ -1,0 +1,93 @@
+"""It learns: the short road where costs do not matter, the long one where they do."""
+
+from typing import Any
+
+import gymnasium as gym
+import numpy as np
+import pytest
+from gymnasium import spaces
+from stable_baselines3.common.monitor import Monitor
+
+from sb3_esad import ESADLEND
+from sb3_esad.common.evaluation import evaluate_policy
+
+
+class TwoRoads(gym.Env):
+    """
+    A junction, and two roads to the same place: a short one of three steps that costs, a long one of six that does not.
+
+    The choice is made by the first action of an episode, and nothing that is done afterwards matters. Each step has a
+    reward of -1.
+
+    :param chance: of a cost of 1 in the midst of the short road
+    """
+
+    observation_space = spaces.Box(-1.0, 1.0, (3,), np.float32)
+    action_space = spaces.Box(-1.0, 1.0, (1,), np.float32)
+
+    def __init__(self, chance: float) -> None:
+        self.chance = chance
+        self.road, self.steps_left = 0, 0
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict[str, Any]]:
+        super().reset(seed=seed)
+        self.road = self.steps_left = 0
+        return self._observe(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        if self.road == 0:
+            self.road, self.steps_left = (1, 3) if action[0] > 0 else (-1, 6)
+        self.steps_left -= 1
+        midway = self.road == 1 and self.steps_left == 1
+        cost = float(midway and self.np_random.random() < self.chance)
+        return self._observe(), -1.0, self.steps_left == 0, False, {"cost": cost}
+
+    def _observe(self) -> np.ndarray:
+        return np.array([self.road == 0, self.road, self.steps_left / 6], dtype=np.float32)
+
+
+def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
+    return ESADLEND(
+        "MlpPolicy",
+        Monitor(TwoRoads(chance)),
+        cost_limit=cost_limit,
+        learning_rate=5e-3,
+        learning_starts=200,
+        pretrain_steps=30,
+        train_freq=8,
+        batch_size=8,
+        sequence_length=8,
+        imagination_horizon=4,
+        imagination_starts=96,
+        behavior_batches=4,
+        uniform_action_prob=0.5,
+        tau=0.05,
+        ent_coef=0.03,
+        lambda_lr=0.05,
+        penalty_warmup=20,
+        buffer_size=10_000,
+        policy_kwargs={
+            "net_arch": [32],
+            "memory_channels": 32,
+            "latent_channels": 4,
+            "features_extractor_kwargs": {"features_dim": 32},
+        },
+        seed=seed,
+        device="cpu",
+    ).learn(800)
+
+
+@pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])
+def test_a_limit_makes_it_take_the_long_road(chance: float, seed: int) -> None:
+    model = learn(0.2, chance, seed)
+    reward, _, cost = evaluate_policy(model, Monitor(TwoRoads(chance)), 10)
+    assert (reward, cost) == (-6.0, 0.0)
+    _, _, cost = evaluate_policy(model, Monitor(TwoRoads(chance)), 20, deterministic=False)
+    assert np.mean(cost) <= 0.2
+
+
+@pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])
+def test_without_a_limit_it_takes_the_short_road(chance: float, seed: int) -> None:
+    model = learn(None, chance, seed)
+    reward, _, cost = evaluate_policy(model, Monitor(TwoRoads(chance)), 10)
+    assert reward == -3.0 and np.mean(cost) > 0.2
