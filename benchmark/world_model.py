@@ -59,10 +59,11 @@ def steps(config: dict[str, Any], seed: int) -> Iterator[Step]:
     while True:
         observation, _ = env.reset(seed=int(random.integers(2**31)))
         driver, wild = drivers[random.integers(3)], random.random() < 0.6
-        amplitude, bias, done, count = random.choice([0.1, 0.3, 0.8]), random.choice([0.0, 0.15, 0.3]), False, 0
+        pedal, steering, bias = random.choice([0.1, 0.5, 1.0]), random.choice([0.05, 0.1, 0.3]), random.choice([0.0, 0.15, 0.3])
+        done, count = False, 0
         while not done:
             if count % 5 == 0:
-                noise = random.uniform(-1, 1, 2) * amplitude + [bias, 0]
+                noise = random.uniform(-1, 1, 2) * [pedal, steering] + [bias, 0]
             count += 1
             action = np.clip(driver(env) + (noise if wild else 0), -1, 1).astype(np.float32)
             following, reward, terminated, truncated, info = env.step(action)

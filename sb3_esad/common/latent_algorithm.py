@@ -95,7 +95,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         self,
         policy: str | type[LatentPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 1e-3,
+        learning_rate: float | Schedule = 5e-3,
         buffer_size: int = 100_000,
         learning_starts: int = 1000,
         batch_size: int = 16,

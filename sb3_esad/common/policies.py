@@ -15,6 +15,7 @@ from sb3_esad.common.checks import require
 from sb3_esad.common.critics import CostCritic, QEnsemble, make_target
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
+from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import RSSM
 from sb3_esad.common.type_aliases import LatentState
@@ -60,11 +61,9 @@ class LatentPolicy(BasePolicy):
         features_extractor_class: type[BaseFeaturesExtractor] | None = None,
         features_extractor_kwargs: dict[str, Any] | None = None,
         normalize_images: bool = True,
-        optimizer_class: type[th.optim.Optimizer] = th.optim.Adam,
+        optimizer_class: type[th.optim.Optimizer] = MuonWithAdam,
         optimizer_kwargs: dict[str, Any] | None = None,
     ) -> None:
-        if optimizer_kwargs is None and optimizer_class is th.optim.Adam:
-            optimizer_kwargs = {"fused": True}
         features_extractor_class = features_extractor_class or self.extractor_class
         if not normalize_images and issubclass(features_extractor_class, SpatialCnn | CombinedExtractor):
             features_extractor_kwargs = {"normalized_image": True, **(features_extractor_kwargs or {})}

@@ -16,7 +16,8 @@ class GridGRU(nn.Module):
     """
     Gated recurrent unit on a grid: each cell sees its neighbours, the mean of all cells, and the action.
 
-    The mean carries what has no place, such as the own speed, to every cell within one step.
+    The mean carries what has no place, such as the own speed, to every cell within one step. The action has a layer of its own:
+    as two numbers beside hundreds it would be learned last.
 
     :param memory_shape: shape of the memory (C, H, W)
     :param input_channels: channels of the input grid
@@ -28,7 +29,8 @@ class GridGRU(nn.Module):
         channels = memory_shape[0]
         hidden = 2 * channels
         self.local = same_conv(channels + input_channels, hidden, kernel_size(memory_shape))
-        self.everywhere = nn.Linear(channels + action_dim, hidden)
+        self.embed_action = nn.Sequential(nn.Linear(action_dim, hidden), nn.LayerNorm(hidden), nn.SiLU())
+        self.everywhere = nn.Linear(channels + hidden, hidden)
         self.norm = ChannelNorm(hidden)
         self.gates = nn.Sequential(same_conv(hidden, 3 * channels, 1), ChannelNorm(3 * channels))
 
@@ -41,7 +43,7 @@ class GridGRU(nn.Module):
         :param action: shape (N, action_dim)
         :return: the next memory, of the shape of ``memory``
         """
-        common = self.everywhere(th.cat([memory.mean((-2, -1)), action], dim=1))
+        common = self.everywhere(th.cat([memory.mean((-2, -1)), self.embed_action(action)], dim=1))
         # A hidden layer, for what moves must be shifted by its speed: a product, which gates alone express badly
         hidden = nn.functional.silu(self.norm(self.local(th.cat([memory, inputs], dim=1)) + common[..., None, None]))
         gates = self.gates(hidden)

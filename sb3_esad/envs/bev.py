@@ -19,6 +19,7 @@ BLEED = 0.7 * 2**SUBPIXEL_BITS  # measured: a filled shape comes out this much l
 STANDING_GREY, USER_SPAN, EGO_SPAN, OBSTACLE_GREY = 95, 160, 100, 255
 TOP_SPEED = 40.0  # the speed of the brightest grey level [m/s]
 DIAL_SPEED, DIAL_GREY = 32.0, 160  # the speed at which the dial is as high as the image [m/s]
+DIAL_SHARE = 1 / 16  # of the image's width, at either edge
 OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
 
 
@@ -115,7 +116,7 @@ def user_greys(traffic: Traffic) -> list[int]:
 
 def draw_dial(image: Image, speed: float) -> None:
     """
-    Show a speed as the height of a bar at either edge, to a fraction of a pixel.
+    Show a speed as the height of a bar at either edge, to a fraction of a pixel, over what may be there.
 
     Grey levels alone are too faint for this: an agent that learns to see by squared error would take notice of its own speed
     only after it has learned everything else, and until then believe that braking changes nothing.
@@ -125,7 +126,8 @@ def draw_dial(image: Image, speed: float) -> None:
     """
     height = min(speed / DIAL_SPEED, 1.0) * image.shape[0]
     filled = np.clip(height - np.arange(image.shape[0])[::-1], 0.0, 1.0)
-    image[:, [0, -1]] = np.rint(DIAL_GREY * filled).astype(np.uint8)[:, None]
+    width = max(1, round(DIAL_SHARE * image.shape[1]))
+    image[:, :width] = image[:, -width:] = np.rint(DIAL_GREY * filled).astype(np.uint8)[:, None]
 
 
 class BirdsEyeView:

@@ -1,0 +1,86 @@
+"""Muon for matrices and kernels, Adam for the rest."""
+
+from copy import deepcopy
+
+import pytest
+import torch as th
+from torch import nn
+
+from sb3_esad.common.optimizers import MuonWithAdam
+
+
+def backward(network: nn.Module, seed: int = 0) -> None:
+    inputs = th.randn(8, 3, 8, 8, generator=th.Generator().manual_seed(seed))
+    network.zero_grad()
+    network(inputs).square().sum().backward()
+
+
+def small_network(channels_last: bool = False) -> nn.Sequential:
+    th.manual_seed(0)
+    network = nn.Sequential(nn.Conv2d(3, 24, 4, stride=4), nn.SiLU(), nn.Conv2d(24, 20, 1), nn.Flatten(), nn.Linear(80, 1))
+    return network.to(memory_format=th.channels_last) if channels_last else network  # type: ignore[call-overload]
+
+
+@pytest.mark.parametrize("shape", [(32, 64), (64, 32), (24, 3, 4, 4)])
+def test_a_step_is_orthogonal_and_as_large_as_adams(shape: tuple[int, ...]) -> None:
+    """All singular values of the step are near 0.2 lr sqrt(max(m, n)): its entries' root mean square is 0.2 lr at full rank."""
+    weight = nn.Parameter(th.zeros(shape))
+    optimizer = MuonWithAdam([weight], lr=0.01)
+    weight.grad = th.randn(shape, generator=th.Generator().manual_seed(1))
+    optimizer.step()
+    matrix = weight.detach().flatten(1)
+    values = th.linalg.svdvals(matrix) / (0.2 * 0.01 * max(matrix.shape) ** 0.5)
+    assert values.min() > 0.6 and values.max() < 1.3
+
+
+def test_a_matrix_moves_as_by_muon_and_a_bias_as_by_adam() -> None:
+    matrix, bias = nn.Parameter(th.randn(16, 20)), nn.Parameter(th.randn(16))
+    twins = [nn.Parameter(p.detach().clone()) for p in (matrix, bias)]
+    together = MuonWithAdam([matrix, bias], lr=0.01)
+    muon = th.optim.Muon(twins[:1], lr=0.01, weight_decay=0.0, adjust_lr_fn="match_rms_adamw")
+    adam = th.optim.Adam(twins[1:], lr=0.01, betas=(0.9, 0.99))
+    for _ in range(3):
+        for p, twin in zip((matrix, bias), twins, strict=True):
+            p.grad = th.randn_like(p)
+            twin.grad = p.grad.clone()
+        for optimizer in (together, muon, adam):
+            optimizer.step()
+    th.testing.assert_close(matrix, twins[0])
+    th.testing.assert_close(bias, twins[1])
+
+
+def test_the_order_in_memory_does_not_matter() -> None:
+    networks = [small_network(), small_network(channels_last=True)]
+    for network in networks:
+        optimizer = MuonWithAdam(network.parameters(), lr=0.01)
+        for seed in range(3):
+            backward(network, seed)
+            optimizer.step()
+    for one, other in zip(networks[0].parameters(), networks[1].parameters(), strict=True):
+        th.testing.assert_close(one, other.contiguous(), rtol=1e-3, atol=1e-5)
+
+
+def test_it_goes_on_from_a_saved_state_and_from_loaded_weights() -> None:
+    network = small_network()
+    optimizer = MuonWithAdam(network.parameters(), lr=0.01)
+    backward(network)
+    optimizer.step()
+    other = small_network()
+    successor = MuonWithAdam(other.parameters(), lr=0.5)
+    other.load_state_dict(deepcopy(network.state_dict()))
+    successor.load_state_dict(deepcopy(optimizer.state_dict()))
+    for each, its_optimizer in ((network, optimizer), (other, successor)):
+        backward(each, 1)
+        its_optimizer.step()
+    for one, another in zip(network.parameters(), other.parameters(), strict=True):
+        assert th.equal(one, another)
+
+
+def test_a_learning_rate_of_zero_moves_nothing() -> None:
+    network = small_network()
+    optimizer = MuonWithAdam(network.parameters(), lr=0.01)
+    optimizer.param_groups[0]["lr"] = 0.0
+    before = deepcopy(network.state_dict())
+    backward(network)
+    optimizer.step()
+    assert all(th.equal(before[name], value) for name, value in network.state_dict().items())
