@@ -59,7 +59,11 @@ def steps(config: dict[str, Any], seed: int) -> Iterator[Step]:
     while True:
         observation, _ = env.reset(seed=int(random.integers(2**31)))
         driver, wild = drivers[random.integers(3)], random.random() < 0.6
-        pedal, steering, bias = random.choice([0.1, 0.5, 1.0]), random.choice([0.05, 0.1, 0.3]), random.choice([0.0, 0.15, 0.3])
+        pedal, steering, bias = (
+            random.choice([0.1, 0.5, 1.0]),
+            random.choice([0.05, 0.1, 0.3]),
+            random.choice([0.0, 0.15, 0.3]),
+        )
         done, count = False, 0
         while not done:
             if count % 5 == 0:

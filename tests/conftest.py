@@ -21,7 +21,6 @@ TINY: dict[str, Any] = {
     "imagination_starts": 16,
     "imagination_horizon": 3,
     "pretrain_steps": 1,
-    "behavior_batches": 1,
     "device": "cpu",
     "seed": 0,
 }

@@ -13,9 +13,10 @@ from sb3_esad.esad_lend.targets import (
     CostTargets,
     Transitions,
     cost_targets,
+    imagined_costs,
+    imagined_returns,
     recorded_cost_targets,
     recorded_return_targets,
-    return_targets,
 )
 
 SHAPE = (1, 1, 1)
@@ -115,6 +116,13 @@ def test_targets_of_the_mean_are_the_mean_of_the_critics() -> None:
         th.testing.assert_close(targets.variances.flatten(), expected_variance.expand(targets.means.numel()))
 
 
+def test_decisions_fear_the_larger_estimate() -> None:
+    policy = cost_policy()
+    means, _ = policy.cost_critic(*state_and_action())
+    imagined = imagined_costs(policy.cost_critic, hazard_dream(0.1, steps=1), GAMMA, 0.95)
+    th.testing.assert_close(imagined, (0.1 + GAMMA * 0.9 * means.max()).view(1, 1))
+
+
 def reward_policy() -> LatentPolicy:
     critic = QEnsemble(SHAPE, 1, [8])
     for network in critic.q_networks:
@@ -127,7 +135,7 @@ def test_return_targets_take_the_smaller_critic_and_stop_at_the_end() -> None:
     values = policy.critic_target(*state_and_action())
     assert values[0] != values[1]
     smaller = values.min()
-    imagined = return_targets(policy, hazard_dream(0.2, 1, reward=3.0), GAMMA, 0.95)
+    imagined = imagined_returns(policy.critic_target, hazard_dream(0.2, 1, reward=3.0), GAMMA, 0.95)
     th.testing.assert_close(imagined, (3.0 + GAMMA * 0.8 * smaller).view(1, 1))
     grids, actions = state_and_action(2)
     outcomes = Predictions(th.tensor([1.0, 2.0]), th.zeros(2), th.tensor([1.0, 0.0]))
@@ -142,7 +150,7 @@ def test_targets_have_no_gradient() -> None:
     targets = [
         *cost_targets(costs, dream, GAMMA, 0.95, 0.0),
         *recorded_cost_targets(costs, record, GAMMA),
-        return_targets(rewards, dream, GAMMA, 0.95),
+        imagined_returns(rewards.critic_target, dream, GAMMA, 0.95),
         recorded_return_targets(rewards, record, GAMMA),
     ]
     assert not any(target.requires_grad for target in targets)

@@ -83,7 +83,6 @@ def test_missing_costs_are_zero_with_one_warning() -> None:
         ("pretrain_steps", -1, ">= 0"),
         ("imagination_horizon", 0, ">= 1"),
         ("imagination_starts", 1, ">= 2"),
-        ("behavior_batches", 0, ">= 1"),
         ("random_hold", 0, ">= 1"),
         ("max_grad_norm", 0.0, "> 0"),
         ("barrier_decay", 0.0, "(0, 1]"),

@@ -22,7 +22,7 @@ from sb3_esad.common.latents import Gaussian
 from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
-from sb3_esad.common.type_aliases import Imagination, LatentState, SequenceSamples
+from sb3_esad.common.type_aliases import Imagination, LatentState, Predictions, SequenceSamples
 from sb3_esad.esad_lend.targets import recorded_transitions
 from tests.conftest import TINY, CountingEnv
 
@@ -76,25 +76,9 @@ def forget_gradients(model: ESADLEND) -> None:
         parameter.grad = None
 
 
-def test_behavior_learns_from_one_share_of_the_dreams_after_the_other() -> None:
-    model = make_model(behavior_batches=3).learn(24)
-    samples, filtered, imagined = imagine(model)
-    recorded = recorded_transitions(model.policy, samples, filtered)
-    whole = imagined.actions[:, :, 0].flatten().tolist(), recorded.actions.flatten().tolist()
-    parts = imagined.split(3), recorded.split(3)
-    shares = [each for part in parts[0] for each in part.actions[:, :, 0].flatten().tolist()]
-    assert sorted(shares) == sorted(whole[0]) and [part.weights.shape[1] for part in parts[0]] == [6, 5, 5]
-    assert sorted(each for part in parts[1] for each in part.actions.flatten().tolist()) == sorted(whole[1])
-    for part in parts[0]:
-        assert len(part.grids) == len(part.actions) == 4 and len(part.weights) == len(part.predictions.rewards) == 3
-    steps = model.policy.actor.optimizer.state_dict()["state"][0]["step"].item()
-    model._update_behavior(samples, filtered, imagined)
-    assert model.policy.actor.optimizer.state_dict()["state"][0]["step"] == steps + 3
-
-
 @pytest.mark.parametrize("settings", [{"batch_size": 1, "sequence_length": 1}, {"imagination_starts": 2}])
-def test_no_share_is_empty(settings: dict[str, Any]) -> None:
-    model = make_model(behavior_batches=4, **settings).learn(32)
+def test_the_smallest_batches_will_do(settings: dict[str, Any]) -> None:
+    model = make_model(**settings).learn(32)
     assert all(parameter.isfinite().all() for parameter in model.policy.parameters())
     assert np.isfinite(model.logger.name_to_value["train/cvar"])
 
@@ -105,9 +89,9 @@ def test_each_update_moves_one_network() -> None:
     recorded = recorded_transitions(model.policy, samples, filtered)
     updates = {
         "world_model": lambda: model._update_world_model(samples),
-        "critic": lambda: model._update_critic(imagined, recorded),
-        "cost_critic": lambda: model._update_cost_critic(imagined, recorded),
-        "actor": lambda: model._update_actor(imagined),
+        "critic": lambda: model._update_critic(imagined.detach(), recorded),
+        "cost_critic": lambda: model._update_cost_critic(imagined.detach(), recorded),
+        "actor": lambda: model._update_actor(imagine(model)[2]),
     }
     for name, update in updates.items():
         forget_gradients(model)
@@ -153,6 +137,16 @@ class KnownCostCritic(th.nn.Module):
         return th.stack([mean, 0.5 * mean]), 0.25 * mean + 1e-8
 
 
+def predict_nothing(model: ESADLEND) -> None:
+    """No reward, no cost, no end."""
+
+    def predict(grids: th.Tensor) -> Predictions:
+        zeros = th.zeros(grids.shape[:2])
+        return Predictions(zeros, zeros, zeros + 1.0)
+
+    cast(Any, model.policy.world_model).predict = predict
+
+
 @pytest.mark.parametrize(
     ("settings", "best"),
     [
@@ -163,39 +157,68 @@ class KnownCostCritic(th.nn.Module):
     ],
 )
 def test_actor_finds_the_best_of_known_values(settings: dict[str, Any], best: float) -> None:
-    """A multiplier of 2 weighs the risk against the value; entropy has no part in it."""
-    fixed = {"lagrangian_multiplier_init": 2.0, "penalty_coef": 0.0, "ent_coef": 0.0, "learning_rate": 0.02}
-    model = make_model(**{**fixed, **settings}).learn(24)
+    """A multiplier of 2 weighs the risk against the value; entropy and what is predicted have no part in it."""
+    fixed = {"lagrangian_multiplier_init": 2.0, "penalty_coef": 0.0, "ent_coef": 0.0, "learning_rate": 0.02, "gamma": 0.99}
+    model = make_model(**{**fixed, **settings, "lambda_return": 0.0}).learn(24)
     model.policy.critic, model.policy.cost_critic = cast(Any, KnownCritic()), cast(Any, KnownCostCritic())
-    _, _, imagined = imagine(model)
+    predict_nothing(model)
     for _ in range(150):
+        _, _, imagined = imagine(model)
         model._update_actor(imagined)
     actions = model.policy.actor(imagined.grids[0], deterministic=True)
     # The rest is due to the spread of the policy, which cannot vanish
     assert actions.mean().item() == pytest.approx(best, abs=0.05)
 
 
-def actor_gradient(model: ESADLEND, imagined: Imagination) -> th.Tensor:
-    """Gradient of the actor's loss; the policy stays as it is."""
+def actor_gradient(model: ESADLEND) -> tuple[float, th.Tensor]:
+    """Loss of the actor and its gradient, always on the same dreams of the same noise; the policy stays as it is."""
     saved = {name: value.clone() for name, value in model.policy.actor.state_dict().items()}
+    np.random.seed(0)
     th.manual_seed(0)
-    model._update_actor(imagined)
+    _, _, imagined = imagine(model)
+    loss = model._update_actor(imagined)["actor_loss"]
     model.policy.actor.load_state_dict(saved)
-    return th.cat([parameter.grad.flatten() for parameter in model.policy.actor.parameters() if parameter.grad is not None])
+    gradients = [parameter.grad for parameter in model.policy.actor.parameters()]
+    return loss, th.cat([gradient.flatten() for gradient in gradients if gradient is not None])
 
 
 @pytest.mark.parametrize("cost_limit", [None, 0.05])
 def test_without_a_limit_costs_do_not_reach_the_actor(cost_limit: float | None) -> None:
     model = make_model(cost_limit=cost_limit, ent_coef=0.1).learn(24)
-    _, _, imagined = imagine(model)
-    before = actor_gradient(model, imagined)
+    _, before = actor_gradient(model)
     for parameter in model.policy.cost_critic.parameters():
         th.nn.init.uniform_(parameter, -1.0, 1.0)
-    scrambled = actor_gradient(model, imagined)
+    _, scrambled = actor_gradient(model)
     assert th.equal(before, scrambled) == (cost_limit is None)
     for parameter in model.policy.cost_critic.parameters():
         th.nn.init.constant_(parameter, th.nan)
-    assert actor_gradient(model, imagined).isfinite().all() == (cost_limit is None)
+    _, broken = actor_gradient(model)
+    assert broken.isfinite().all() == (cost_limit is None)
+
+
+@pytest.mark.parametrize("cost_limit", [None, 0.05])
+def test_the_actor_is_told_what_its_actions_do_to_the_steps_that_follow(
+    cost_limit: float | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its gradient is the slope of its loss, found by moving it a little along the gradient and imagining again."""
+    monkeypatch.setattr("sb3_esad.common.world_model.working_dtype", lambda device: th.float32)
+    fixed = {"penalty_coef": 0.0, "ent_coef": 0.0, "max_grad_norm": 1e9, "uniform_action_prob": 0.0}
+    model = make_model(cost_limit=cost_limit, **fixed).learn(24)
+    world_model: Any = model.policy.world_model
+    predict = world_model.predict
+    # Of the probability to go on, the weights of the steps would be a part that has no gradient on purpose
+    world_model.predict = lambda grids: (lambda p: p._replace(continues=th.full_like(p.continues, 0.9)))(predict(grids))
+    for network in (world_model.predictions.reward, *model.policy.critic.q_networks):
+        th.nn.init.normal_(cast(Any, network)[-1].weight, std=0.3)
+    _, gradient = actor_gradient(model)
+    parameters, step = list(model.policy.actor.parameters()), 1e-2 * gradient / gradient.norm()
+    middle = th.nn.utils.parameters_to_vector(parameters).detach()
+    losses = []
+    for sign in (1.0, -1.0):
+        th.nn.utils.vector_to_parameters(middle + sign * step, parameters)
+        losses.append(actor_gradient(model)[0])
+    slope = (losses[0] - losses[1]) / (2 * step.norm())
+    assert slope.item() == pytest.approx(gradient.norm().item(), rel=0.03)
 
 
 def test_limits_choose_their_penalty() -> None:

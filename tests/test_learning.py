@@ -59,7 +59,6 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         sequence_length=8,
         imagination_horizon=4,
         imagination_starts=96,
-        behavior_batches=4,
         uniform_action_prob=0.5,
         tau=0.05,
         ent_coef=0.03,

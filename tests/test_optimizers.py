@@ -23,7 +23,7 @@ def small_network(channels_last: bool = False) -> nn.Sequential:
 
 @pytest.mark.parametrize("shape", [(32, 64), (64, 32), (24, 3, 4, 4)])
 def test_a_step_is_orthogonal_and_as_large_as_adams(shape: tuple[int, ...]) -> None:
-    """All singular values of the step are near 0.2 lr sqrt(max(m, n)): its entries' root mean square is 0.2 lr at full rank."""
+    """All singular values are near 0.2 lr sqrt(max(m, n)), so that the root mean square of the entries is 0.2 lr."""
     weight = nn.Parameter(th.zeros(shape))
     optimizer = MuonWithAdam([weight], lr=0.01)
     weight.grad = th.randn(shape, generator=th.Generator().manual_seed(1))

@@ -25,7 +25,9 @@ def make_target(network: Module) -> Module:
 
 class StateActionFeatures(nn.Module):
     """
-    Summary of a latent state beside its action.
+    Summary of a latent state beside its action, in as many numbers each.
+
+    What an action does in a single step is little, and as a few numbers beside hundreds it would be learned last.
 
     :param grid_shape: shape of the latent grid (C, H, W)
     :param action_dim: length of the action
@@ -35,7 +37,8 @@ class StateActionFeatures(nn.Module):
     def __init__(self, grid_shape: GridShape, action_dim: int, units: int) -> None:
         super().__init__()
         self.readout = GridReadout(grid_shape, units)
-        self.features_dim = units + action_dim
+        self.embed_action = nn.Sequential(nn.Linear(action_dim, units), nn.LayerNorm(units), nn.SiLU())
+        self.features_dim = 2 * units
 
     def forward(self, grid: th.Tensor, action: th.Tensor) -> th.Tensor:
         """
@@ -45,7 +48,7 @@ class StateActionFeatures(nn.Module):
         :param action: their actions, of shape (N, A)
         :return: shape (N, features_dim)
         """
-        return th.cat([self.readout(grid), action], dim=1)
+        return th.cat([self.readout(grid), self.embed_action(action)], dim=1)
 
 
 class QEnsemble(LearningModule):

@@ -332,7 +332,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
         :param samples: recorded windows
         :param filtered: their states, without gradient
-        :param imagined: trajectories of the present policy
+        :param imagined: trajectories of the present policy, with the gradients of later states by earlier actions
         :return: values to log
         """
 
@@ -360,8 +360,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         return self.policy.world_model.imagine(start, self.policy.actor, self.imagination_horizon, self.gamma)
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
-        with th.no_grad():
-            return self.policy.actor(self.policy.world_model.features(start))
+        return self.policy.actor(self.policy.world_model.features(start))
 
     def _choose_starts(self, samples: SequenceSamples, filtered: Filtered) -> LatentState:
         """Half the starts come from uniformly drawn windows, half from shortly before a cost; the former stand first."""

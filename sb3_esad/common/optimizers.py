@@ -23,7 +23,11 @@ class MuonWithAdam(th.optim.Optimizer):
     """
 
     def __init__(
-        self, params: Iterable[th.nn.Parameter], lr: float = 5e-3, momentum: float = 0.95, betas: tuple[float, float] = (0.9, 0.99)
+        self,
+        params: Iterable[th.nn.Parameter],
+        lr: float = 5e-3,
+        momentum: float = 0.95,
+        betas: tuple[float, float] = (0.9, 0.99),
     ) -> None:
         parameters = list(params)
         super().__init__(parameters, {"lr": lr})

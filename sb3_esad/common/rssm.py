@@ -16,8 +16,8 @@ class GridGRU(nn.Module):
     """
     Gated recurrent unit on a grid: each cell sees its neighbours, the mean of all cells, and the action.
 
-    The mean carries what has no place, such as the own speed, to every cell within one step. The action has a layer of its own:
-    as two numbers beside hundreds it would be learned last.
+    The mean carries what has no place, such as the own speed, to every cell within one step. The action has a layer of its
+    own: as two numbers beside hundreds it would be learned last.
 
     :param memory_shape: shape of the memory (C, H, W)
     :param input_channels: channels of the input grid

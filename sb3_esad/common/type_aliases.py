@@ -6,8 +6,6 @@ from typing import NamedTuple
 import torch as th
 from stable_baselines3.common.type_aliases import TensorDict
 
-from sb3_esad.common.torch_layers import join
-
 Logs = dict[str, float]
 
 NO_EVENT = 2**31 - 1
@@ -102,16 +100,11 @@ class Imagination(NamedTuple):
     predictions: Predictions
     weights: th.Tensor
 
-    def split(self, n: int) -> list["Imagination"]:
+    def detach(self) -> "Imagination":
         """
-        Deal the trajectories out into batches.
+        Cut the gradient.
 
-        :param n: number of batches, at most N
-        :return: every n-th trajectory from the first on, from the second on, and so forth
+        :return: the same trajectories as constants
         """
-        return [self._every(slice(k, None, n)) for k in range(n)]
-
-    def _every(self, some: slice) -> "Imagination":
-        grids = join([grid[some] for grid in self.grids])
-        predictions = Predictions(*(field[:, some] for field in self.predictions))
-        return Imagination(grids, self.actions[:, some], predictions, self.weights[:, some])
+        predictions = Predictions(*(field.detach() for field in self.predictions))
+        return Imagination(self.grids.detach(), self.actions.detach(), predictions, self.weights.detach())

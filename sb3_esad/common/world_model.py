@@ -121,10 +121,9 @@ class WorldModel(LearningModule):
         first = self.filter(self.initial(int(is_first.sum())), opening)
         return self.rssm.scan(first, is_first, actions, embeddings.unflatten(0, actions.shape[:2]), hidden)
 
-    @th.no_grad()
     def imagine(self, start: LatentState, policy: Callable[[th.Tensor], th.Tensor], horizon: int, gamma: float) -> Imagination:
         """
-        Roll the policy out in the latent space.
+        Roll the policy out in the latent space, differentiably: later states depend on earlier actions.
 
         :param start: N states and the first actions to take
         :param policy: draws the actions that follow, of shape (N, A), for features of states

@@ -24,10 +24,11 @@ from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
     Transitions,
     cost_targets,
+    imagined_costs,
+    imagined_returns,
     recorded_cost_targets,
     recorded_return_targets,
     recorded_transitions,
-    return_targets,
     taken,
 )
 
@@ -59,7 +60,6 @@ class ESADLEND(LatentAlgorithm):
     :param replay_critic_coef: weight of recorded transitions in the loss of the reward critics
     :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics
     :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
-    :param behavior_batches: steps of actor and critics per update, each on its share of the imagined trajectories
     :param kwargs: see :class:`LatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
@@ -91,7 +91,6 @@ class ESADLEND(LatentAlgorithm):
         replay_critic_coef: float = 0.3,
         replay_cost_critic_coef: float = 1.0,
         uniform_action_prob: float = 0.3,
-        behavior_batches: int = 1,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
@@ -112,7 +111,6 @@ class ESADLEND(LatentAlgorithm):
         self.replay_critic_coef = replay_critic_coef
         self.replay_cost_critic_coef = replay_cost_critic_coef
         self.uniform_action_prob = uniform_action_prob
-        self.behavior_batches = behavior_batches
         if _init_setup_model:
             self._setup_model()
 
@@ -124,7 +122,6 @@ class ESADLEND(LatentAlgorithm):
         require(self.barrier_steps >= 1, "barrier_steps", self.barrier_steps, "a number of steps >= 1")
         uniform = self.uniform_action_prob
         require(0 <= uniform <= 1, "uniform_action_prob", uniform, "a probability in [0, 1]")
-        require(self.behavior_batches >= 1, "behavior_batches", self.behavior_batches, "a number of batches >= 1")
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -202,16 +199,10 @@ class ESADLEND(LatentAlgorithm):
         return th.where(explore, 2 * th.rand_like(actions) - 1, actions)
 
     def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
-        recorded = recorded_transitions(self.policy, samples, filtered)
-        n = min(self.behavior_batches, self.imagination_starts // 2, len(recorded.actions))
-        batches = zip(imagined.split(n), recorded.split(n), strict=True)
-        logs = [self._update_networks(*batch) for batch in batches]
-        return {name: float(np.mean([each[name] for each in logs])) for name in logs[0]}
-
-    def _update_networks(self, imagined: Imagination, recorded: Transitions) -> Logs:
+        recorded, fixed = recorded_transitions(self.policy, samples, filtered), imagined.detach()
         logs = {
-            **self._update_critic(imagined, recorded),
-            **self._update_cost_critic(imagined, recorded),
+            **self._update_critic(fixed, recorded),
+            **self._update_cost_critic(fixed, recorded),
             **self._update_actor(imagined),
         }
         for name in ("critic", "cost_critic"):
@@ -220,7 +211,8 @@ class ESADLEND(LatentAlgorithm):
         return logs
 
     def _update_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        targets = return_targets(self.policy, imagined, self.gamma, self.lambda_return)
+        with th.no_grad():
+            targets = imagined_returns(self.policy.critic_target, imagined, self.gamma, self.lambda_return)
         recorded_targets = recorded_return_targets(self.policy, recorded, self.gamma)
         critic = self.policy.critic
         critic.follow_scale(targets)
@@ -256,25 +248,38 @@ class ESADLEND(LatentAlgorithm):
         }
 
     def _update_actor(self, imagined: Imagination) -> Logs:
-        grids, _ = taken(imagined)
-        actions, log_prob = self.policy.actor.action_log_prob(grids)
-        value = self.policy.critic(grids, actions).min(0).values
-        # Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
-        # from it to crash less often ("blindness to success", arXiv 2205.05138)
-        risk = self._unbounded_risk(grids, actions)
-        barrier = self._barrier(risk.detach().view_as(imagined.weights))
-        objective = self.entropy() * log_prob - value / self.policy.critic.scale
-        loss = (imagined.weights.flatten() * self.penalty.combine(objective, risk, barrier.flatten())).mean()
+        """
+        Improve the actor by the gradient of imagined returns and costs, back through all the steps that lead to them.
+
+        Not by the gradient of the critics in the action alone: what an action does in one step is less than their error, while
+        what a change of behaviour does over many steps is what the world model knows best (docs/experiments.md, section 5).
+        """
+        _, log_prob = self.policy.actor.action_log_prob(imagined.grids[:-1].detach().flatten(0, 1))
+        returns = imagined_returns(self.policy.critic, imagined, self.gamma, self.lambda_return)
+        risk = self._imagined_risk(imagined)
+        barrier = self._barrier(risk.detach())
+        objective = self.entropy() * log_prob.view_as(returns) - returns / self.policy.critic.scale
+        loss = (imagined.weights.detach() * self.penalty.combine(objective, risk, barrier)).mean()
         self._step(self.policy.actor, loss)
-        usual_risk = risk.detach()[: imagined.weights.shape[1] // 2].mean()
         return {
             "actor_loss": loss.item(),
-            "cvar": usual_risk.item(),
+            "cvar": risk[:, : risk.shape[1] // 2].mean().item(),
             "barrier_residual": barrier.relu().mean().item(),
             "entropy": -log_prob.mean().item(),
             "return_scale": self.policy.critic.scale.item(),
-            **self.entropy.update(log_prob),
+            **self.entropy.update(log_prob.detach()),
         }
+
+    def _imagined_risk(self, imagined: Imagination) -> th.Tensor:
+        """
+        Safety measure of each imagined step, of shape (H, N).
+
+        Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
+        from it to crash less often ("blindness to success", arXiv 2205.05138): hence without the bound.
+        """
+        costs = imagined_costs(self.policy.cost_critic, imagined, self._cost_gamma, self.lambda_return)
+        _, variance = self.policy.cost_critic(*taken(imagined))
+        return capped_cvar(costs, variance.view_as(costs), self.risk_level, math.inf)
 
     def risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -284,11 +289,8 @@ class ESADLEND(LatentAlgorithm):
         :param actions: their actions, of shape (N, A)
         :return: shape (N,)
         """
-        return self._unbounded_risk(grids, actions).clamp(max=self.policy.cost_critic.bound)
-
-    def _unbounded_risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         means, variance = self.policy.cost_critic(grids, actions)
-        return capped_cvar(means, variance, self.risk_level, math.inf).max(0).values
+        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic.bound).max(0).values
 
     def _barrier(self, risk: th.Tensor) -> th.Tensor:
         """Residual at each imagined step, of shape (H, N); the last m steps look too far ahead and count as safe."""

@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import torch as th
 
+from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.functional import (
     expected_squared_error,
     indicator_joint,
@@ -33,20 +34,6 @@ class Transitions(NamedTuple):
     next_actions: th.Tensor
     outcomes: Predictions
     event_weights: th.Tensor
-
-    def split(self, n: int) -> list["Transitions"]:
-        """
-        Deal the transitions out into batches.
-
-        :param n: number of batches
-        :return: every n-th transition from the first on, from the second on, and so forth
-        """
-        return [self._every(slice(k, None, n)) for k in range(n)]
-
-    def _every(self, some: slice) -> "Transitions":
-        grids, actions, next_grids, next_actions = (field[some] for field in self[:4])
-        outcomes = Predictions(*(field[some] for field in self.outcomes))
-        return Transitions(grids, actions, next_grids, next_actions, outcomes, self.event_weights[some])
 
 
 class CostTargets(NamedTuple):
@@ -98,20 +85,34 @@ def reached(imagined: Imagination) -> tuple[th.Tensor, th.Tensor]:
     return imagined.grids[1:].flatten(0, 1), imagined.actions[1:].flatten(0, 1)
 
 
-@th.no_grad()
-def return_targets(policy: LatentPolicy, imagined: Imagination, gamma: float, lambda_: float) -> th.Tensor:
+def imagined_returns(critic: QEnsemble, imagined: Imagination, gamma: float, lambda_: float) -> th.Tensor:
     """
-    Lambda-returns of the reward, bootstrapped by the smaller of the target critics.
+    Lambda-returns of the reward, bootstrapped by the smallest estimate.
 
-    :param policy: owns the critics
+    :param critic: ensemble to bootstrap from
     :param imagined: trajectories of H steps
     :param gamma: discount
     :param lambda_: mixing of n-step returns
     :return: shape (H, N)
     """
     rewards, _, continues = imagined.predictions
-    values = policy.critic_target(*reached(imagined)).min(0).values.view_as(rewards)
+    values = critic(*reached(imagined)).min(0).values.view_as(rewards)
     return lambda_return(rewards.T, continues.T, values.T, gamma, lambda_).T
+
+
+def imagined_costs(critic: CostCritic, imagined: Imagination, gamma: float, lambda_: float) -> th.Tensor:
+    """
+    Lambda-returns of the cost, bootstrapped by the largest estimate: pessimism belongs to decisions, not to targets.
+
+    :param critic: ensemble to bootstrap from
+    :param imagined: trajectories of H steps
+    :param gamma: discount of the cost
+    :param lambda_: mixing of n-step returns
+    :return: shape (H, N)
+    """
+    _, costs, continues = imagined.predictions
+    means, _ = critic(*reached(imagined))
+    return lambda_return(costs.T, continues.T, means.max(0).values.view_as(costs).T, gamma, lambda_).T
 
 
 @th.no_grad()
