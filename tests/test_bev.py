@@ -63,7 +63,7 @@ def test_grey_levels_tell_speed_and_kind() -> None:
     for speed, grey in ((0.0, 95), (20.0, 175), (40.0, 255), (60.0, 255)):
         image = see(ego(speed=20.0), User((70.0, 4.0), 0.0, speed))
         assert image[1].max() == grey
-        assert image[2][:, 1:-1].max() == 95 + 50
+        assert image[2][:, 4:-4].max() == 95 + 50
     obstacle = see(ego(), User((70.0, 4.0), kind=Kind.STATIC))
     assert obstacle[1].max() == 0
     assert obstacle[2].max() == 255
@@ -123,4 +123,4 @@ def test_other_sizes_and_scales() -> None:
     image = BirdsEyeView(view).draw(ROAD.markings, scene(ego()), 0.0)
     assert image.shape == (3, 96, 48)
     assert image.dtype == np.uint8
-    assert np.flatnonzero(image[2][:, 1:-1].any(1)).mean() == pytest.approx(96 * 0.75 - 0.5, abs=1.0)
+    assert np.flatnonzero(image[2][:, 4:-4].any(1)).mean() == pytest.approx(96 * 0.75 - 0.5, abs=1.0)

@@ -61,7 +61,7 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         imagination_starts=96,
         uniform_action_prob=0.5,
         tau=0.05,
-        ent_coef=0.03,
+        ent_coef=0.2,
         lambda_lr=0.05,
         penalty_warmup=20,
         buffer_size=10_000,
@@ -73,7 +73,7 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         },
         seed=seed,
         device="cpu",
-    ).learn(800)
+    ).learn(1000)
 
 
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])
@@ -82,7 +82,7 @@ def test_a_limit_makes_it_take_the_long_road(chance: float, seed: int) -> None:
     reward, _, cost = evaluate_policy(model, Monitor(TwoRoads(chance)), 10)
     assert (reward, cost) == (-6.0, 0.0)
     _, _, cost = evaluate_policy(model, Monitor(TwoRoads(chance)), 20, deterministic=False)
-    assert np.mean(cost) <= 0.2
+    assert np.sum(cost) <= 8, "more than 8 of 20 would be seen in 1 % of cases under the limit"
 
 
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])

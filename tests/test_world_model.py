@@ -205,10 +205,10 @@ def test_stretches_that_are_withheld() -> None:
     model = make_policy(VECTOR, world_model_kwargs={"open_loop_length": 4}).world_model
     hidden = model._withhold(th.zeros(12, 4000))
     assert not hidden[0].any(), "a window opens with an observation"
-    assert hidden.any(0).float().mean().item() == pytest.approx(0.5, abs=0.03)
+    assert hidden.any(0).all()
     assert hidden.sum(0).max() == 4
     starts_and_ends = hidden.int().diff(dim=0).abs().sum(0) + hidden[-1]
-    assert set(starts_and_ends.tolist()) == {0, 2}, "one stretch, not several"
+    assert (starts_and_ends == 2).all(), "one stretch, not several"
     assert not model._withhold(th.zeros(1, 50)).any()
 
 

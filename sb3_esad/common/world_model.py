@@ -192,12 +192,12 @@ class WorldModel(LearningModule):
         return loss, filtered, {**logs, **kl_logs, "observation_loss": observation_loss.item()}
 
     def _withhold(self, steps: th.Tensor) -> th.Tensor:
-        # Half of the windows hide one stretch, so that the prior is trained on what it will be used for: going on alone
+        # Every window hides one stretch, so that the prior is trained on what it will be used for: going on alone
         length, n = steps.shape
         index = th.arange(length, device=steps.device)[:, None]
         start = th.randint(1, max(2, length), (n,), device=steps.device)
         stretch = th.randint(1, self.open_loop_length + 1, (n,), device=steps.device)
-        return (index >= start) & (index < start + stretch) & (th.rand(n, device=steps.device) < 0.5)
+        return (index >= start) & (index < start + stretch)
 
     def _observation_heads(self) -> ItemsView[str, ObservationHead]:
         return cast(ItemsView[str, ObservationHead], self.observations.items())
