@@ -93,9 +93,11 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
         "--out", type=Path, default=Path("demo"), metavar="FOLDER", help="where to write (default: %(default)s)"
     )
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the training (default: %(default)s)")
-    parser.add_argument("--timesteps", type=_positive, metavar="N", help="environment steps at most")
     parser.add_argument(
-        "--minutes", type=_above_zero, default=6.0, metavar="M", help="of training at most (default: %(default)s)"
+        "--timesteps", type=_positive, default=6000, metavar="N", help="environment steps (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--minutes", type=_above_zero, default=7.0, metavar="M", help="of training at most (default: %(default)s)"
     )
     parser.add_argument(
         "--episodes", type=_positive, default=100, metavar="N", help="of the evaluation (default: %(default)s)"

@@ -24,13 +24,13 @@ UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
 
-def run_demo(folder: Path, seed: int = 0, timesteps: int | None = None, minutes: float = 6.0, episodes: int = 100) -> None:
+def run_demo(folder: Path, seed: int = 0, timesteps: int = 6000, minutes: float = 7.0, episodes: int = 100) -> None:
     """
     Train, evaluate beside two simple drivers, and write model, learning curve, results and video into a folder.
 
     :param folder: where to write
     :param seed: of the training
-    :param timesteps: environment steps at most, None for those of the hyperparameters
+    :param timesteps: environment steps, over which the learning rate falls
     :param minutes: of training at most
     :param episodes: of the evaluation
     :raises ValueError: if the training was too short for a single episode
@@ -51,23 +51,22 @@ def run_demo(folder: Path, seed: int = 0, timesteps: int | None = None, minutes:
         print(f"  {folder / name}")
 
 
-def train(folder: Path, seed: int, timesteps: int | None, minutes: float) -> tuple[ESADLEND, str]:
+def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESADLEND, str]:
     """
     Train until the steps are done or the time is over; write the model and its learning curve.
 
     :param folder: where to write
     :param seed: of the training
-    :param timesteps: environment steps at most, None for those of the hyperparameters
+    :param timesteps: environment steps, over which the learning rate falls
     :param minutes: at most
     :return: the model, and a sentence about its training
     """
     hyperparams = load_hyperparams(ESADLEND, "esad_lend", ENV_ID)
-    steps = hyperparams.n_timesteps if timesteps is None else timesteps
     model = ESADLEND(env=make_vec_env(ENV_ID, hyperparams.n_envs), seed=seed, **hyperparams.arguments)
     history = EpisodeHistory()
-    print(f"Training ESAD-LEND on {ENV_ID} for {steps} steps or {minutes:g} minutes ...", flush=True)
+    print(f"Training ESAD-LEND on {ENV_ID} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
     start = time.monotonic()
-    model.learn(steps, callback=[history, EpisodeProgressBar(history), StopAfter(minutes)])
+    model.learn(timesteps, callback=[history, EpisodeProgressBar(history), StopAfter(minutes)])
     took = (time.monotonic() - start) / 60
     model.save(folder / "esad_lend.zip")
     plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)

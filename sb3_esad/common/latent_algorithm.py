@@ -110,7 +110,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         optimize_memory_usage: bool = False,
         pretrain_steps: int = 100,
         imagination_horizon: int = 10,
-        imagination_starts: int = 128,
+        imagination_starts: int = 48,
         lambda_return: float = 0.95,
         random_hold: int = 3,
         max_grad_norm: float = 100.0,
