@@ -172,12 +172,12 @@ def trained(args: argparse.Namespace, arm: str, seed: int) -> tuple[ESADLEND, in
     """
     policy, config = ARMS[arm]
     env = gym.make(ENV, config=config)
-    algorithm = ESADLEND("CnnPolicy", env, learning_rate=1e-3, buffer_size=1000, policy_kwargs=dict(policy), seed=seed)
+    algorithm = ESADLEND("CnnPolicy", env, buffer_size=1000, policy_kwargs=dict(policy), seed=seed)
     algorithm.replay_buffer = record(config, args.steps, seed, args.length)
     begin, updates = time.perf_counter(), 0
     while (left := 1 - (time.perf_counter() - begin) / args.seconds) > 0:
         for group in algorithm.policy.world_model.optimizer.param_groups:
-            group["lr"] = 1e-3 * min(1.0, (updates + 1) / 100, left / 0.4 + 0.1)
+            group["lr"] = 6e-3 * min(1.0, (updates + 1) / 20, left / 0.4 + 0.1)
         algorithm._update_world_model(algorithm._sample(16))
         updates += 1
     return algorithm, updates

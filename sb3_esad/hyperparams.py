@@ -8,12 +8,9 @@ from typing import Any, NamedTuple
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.utils import LinearSchedule
 
 RUN_KEYS = ("n_timesteps", "n_envs")
 """Keys of RL Zoo that concern the training and not the algorithm."""
-
-LINEAR = "lin_"
 
 NAMED = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
 
@@ -40,27 +37,16 @@ def load_hyperparams(algorithm: type[BaseAlgorithm], name: str, env_id: str) -> 
     :param name: of the file, without ``.yml``
     :param env_id: environment
     :return: its settings
-    :raises ValueError: if the file is missing or no valid YAML, has a key that the constructor does not know, or a schedule
-        without a number
+    :raises ValueError: if the file is missing or no valid YAML, or if it has a key that the constructor does not know
     """
     path = hyperparams_folder() / f"{name}.yml"
     entries = read_entries(path)
     entry = entries.get(env_id, entries.get("default"))
     if not isinstance(entry, dict):
         raise ValueError(f"{path} has neither an entry '{env_id}' nor a 'default'; add one of them.")
-    arguments = {key: _read_schedule(value) for key, value in entry.items() if key not in RUN_KEYS}
+    arguments = {key: value for key, value in entry.items() if key not in RUN_KEYS}
     check_keys(algorithm, arguments, path)
     return Hyperparams(int(entry.get("n_timesteps", 100_000)), int(entry.get("n_envs", 1)), arguments)
-
-
-def _read_schedule(value: object) -> object:
-    """RL Zoo's notation: ``lin_0.005`` falls linearly from 0.005 to zero."""
-    if not isinstance(value, str) or not value.startswith(LINEAR):
-        return value
-    try:
-        return LinearSchedule(float(value.removeprefix(LINEAR)), 0.0, 1.0)
-    except ValueError as error:
-        raise ValueError(f"'{value}' is no schedule: write a number after '{LINEAR}', as in '{LINEAR}0.005'.") from error
 
 
 def hyperparams_folder() -> Path:

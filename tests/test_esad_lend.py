@@ -202,7 +202,7 @@ def test_the_actor_is_told_what_its_actions_do_to_the_steps_that_follow(
 ) -> None:
     """Its gradient is the slope of its loss, found by moving it a little along the gradient and imagining again."""
     monkeypatch.setattr("sb3_esad.common.world_model.working_dtype", lambda device: th.float32)
-    fixed = {"penalty_coef": 0.0, "ent_coef": 0.0, "max_grad_norm": 1e9, "uniform_action_prob": 0.0}
+    fixed: dict[str, Any] = {"penalty_coef": 0.0, "ent_coef": 0.0, "max_grad_norm": 1e9, "uniform_action_prob": 0.0}
     model = make_model(cost_limit=cost_limit, **fixed).learn(24)
     world_model: Any = model.policy.world_model
     predict = world_model.predict

@@ -39,8 +39,7 @@ def test_every_value_is_of_the_right_kind(name: str, env_id: str) -> None:
     """YAML takes 1e-3 for a word, and a word for a number fails late."""
     for key, value in read_entries(FOLDER / f"{name}.yml")[env_id].items():
         if isinstance(value, str):
-            known = key in ("policy", "ent_coef", "target_entropy", "cost_key") or value.startswith("lin_")
-            assert known, f"{key} is the word {value!r}; write 1.0e-3"
+            assert key in ("policy", "ent_coef", "target_entropy", "cost_key"), f"{key} is the word {value!r}; write 1.0e-3"
 
 
 @pytest.mark.parametrize(("name", "env_id"), [entry for entry in ENTRIES if entry[1] != "default"])
@@ -59,12 +58,6 @@ def test_an_entry_is_preferred_to_the_default(folder: Path) -> None:
     assert load_hyperparams(SAC, "mine", "B-v0") == (100_000, 1, {"gamma": 0.5})
 
 
-def test_a_linear_schedule_falls_to_zero(folder: Path) -> None:
-    (folder / "mine.yml").write_text("default: {learning_rate: lin_0.004}\n")
-    schedule = load_hyperparams(SAC, "mine", "A-v0").arguments["learning_rate"]
-    assert [schedule(remaining) for remaining in (1.0, 0.5, 0.0)] == pytest.approx([0.004, 0.002, 0.0])
-
-
 @pytest.mark.parametrize(
     ("text", "message"),
     [
@@ -72,7 +65,6 @@ def test_a_linear_schedule_falls_to_zero(folder: Path) -> None:
         ("default: {cost_limit: 0.9}", r"'cost_limit' in .*mine\.yml is no argument of SAC; did you mean"),
         ("default: {1: 0.9}", r"'1' in .*mine\.yml is no argument of SAC"),
         ("A-v0: {gamma: 0.9}", r"mine\.yml has neither an entry 'B-v0' nor a 'default'"),
-        ("default: {learning_rate: lin_fast}", r"'lin_fast' is no schedule: write a number after 'lin_', as in 'lin_0\.005'"),
         ("default: 3", "neither an entry 'B-v0' nor a 'default'"),
         ("default: {gamma: [}", r"mine\.yml is no valid YAML: .*line 1"),
         ("", "holds no settings by environment id"),

@@ -15,10 +15,10 @@ from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.decoders import ImageHead
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, grid_shape
 from sb3_esad.common.heads import PredictionHeads, ValueDistribution
-from sb3_esad.common.latent_algorithm import EVENT_HORIZON, SETTLING_STEPS, LatentAlgorithm
 from sb3_esad.common.latents import Gaussian, GaussianHead, LatentHead
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.rssm import RSSM, Filtered
+from sb3_esad.common.starts import EVENT_HORIZON, SETTLING_STEPS, choose_starts
 from sb3_esad.common.type_aliases import NO_EVENT, LatentState, Predictions, SequenceSamples
 from sb3_esad.common.world_model import WorldModel
 from tests.conftest import CountingEnv
@@ -491,7 +491,7 @@ def test_settled_states() -> None:
     ]
 
 
-def choose_starts(n: int, filtered: Filtered, **fields: Any) -> list[int]:
+def drawn_starts(n: int, filtered: Filtered, **fields: Any) -> list[int]:
     """Names of the states that imagination starts from."""
     length, windows = filtered.is_first.shape
     defaults: dict[str, Any] = {
@@ -501,8 +501,7 @@ def choose_starts(n: int, filtered: Filtered, **fields: Any) -> list[int]:
         "continues": th.ones(windows, length),
     }
     samples = SimpleNamespace(**{**defaults, **fields})
-    algorithm = cast(LatentAlgorithm, SimpleNamespace(imagination_starts=n))
-    starts = LatentAlgorithm._choose_starts(algorithm, cast(SequenceSamples, samples), filtered)
+    starts = choose_starts(cast(SequenceSamples, samples), filtered, n)
     return [int(name) for name in starts.memory.flatten()]
 
 
@@ -511,7 +510,7 @@ def test_imagination_starts_from_settled_states_half_of_them_usual() -> None:
     time_to_event = th.full((3, 8), NO_EVENT)
     time_to_event[2] = th.arange(10, 2, -1)  # within reach of the horizon from its fourth state on
     uniform = th.tensor([True, True, False])
-    chosen = choose_starts(1000, filtered, uniform=uniform, time_to_event=time_to_event)
+    chosen = drawn_starts(1000, filtered, uniform=uniform, time_to_event=time_to_event)
     usual, dangerous = chosen[:500], chosen[500:]
     assert SETTLING_STEPS == 3 and EVENT_HORIZON == 8
     assert set(usual) == {3, 4, 5, 6, 7, 103, 104, 107}
@@ -522,18 +521,18 @@ def test_imagination_starts_where_an_action_was_taken() -> None:
     """The last state of an episode is none of them, its first state is one."""
     is_first = th.tensor([[0, 0, 0, 0, 1, 0, 0, 0]]) > 0
     filtered = make_filtered([[0, 0, 0, 0, 1, 0, 0, 0]], [[0] * 8])
-    assert set(choose_starts(500, filtered, is_first=is_first)) == {3, 4, 5, 6, 7}
+    assert set(drawn_starts(500, filtered, is_first=is_first)) == {3, 4, 5, 6, 7}
 
 
 def test_without_danger_all_starts_are_usual() -> None:
     filtered = make_filtered([[0] * 6] * 2, [[0] * 6] * 2)
     uniform = th.tensor([True, False])
-    assert set(choose_starts(401, filtered, uniform=uniform)) == {3, 4, 5}
-    assert len(choose_starts(401, filtered, uniform=uniform)) == 401
+    assert set(drawn_starts(401, filtered, uniform=uniform)) == {3, 4, 5}
+    assert len(drawn_starts(401, filtered, uniform=uniform)) == 401
 
 
 def test_any_start_is_better_than_none() -> None:
-    assert set(choose_starts(100, make_filtered([[0, 0]], [[0, 0]]))) == {0, 1}
+    assert set(drawn_starts(100, make_filtered([[0, 0]], [[0, 0]]))) == {0, 1}
 
 
 def test_free_nats_stop_the_pull() -> None:

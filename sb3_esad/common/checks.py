@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import numpy as np
+
 
 def require(valid: bool, name: str, value: Any, remedy: str) -> None:
     """
@@ -15,3 +17,34 @@ def require(valid: bool, name: str, value: Any, remedy: str) -> None:
     """
     if not valid:
         raise ValueError(f"{name} is {value!r}; choose {remedy}.")
+
+
+def refuse_unknown(algorithm: str, arguments: dict[str, Any], not_offered: dict[str, str]) -> None:
+    """
+    Refuse arguments that a constructor does not know.
+
+    :param algorithm: name of the class
+    :param arguments: that were given although they are unknown
+    :param not_offered: what to do without the arguments that other algorithms have
+    :raises ValueError: at an argument of other algorithms
+    :raises TypeError: at any other
+    """
+    for name, value in arguments.items():
+        if name in not_offered:
+            raise ValueError(f"{algorithm} cannot take {name}={value!r}: {not_offered[name]}.")
+        raise TypeError(f"{algorithm} has no argument '{name}'.")
+
+
+def refuse_blank_images(images: dict[str, np.ndarray]) -> None:
+    """
+    Refuse images without any content.
+
+    :param images: a batch by key
+    :raises ValueError: if all pixels of an image are the same
+    """
+    remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
+    for key, batch in images.items():
+        for image in batch:
+            if np.max(image) == np.min(image):
+                reason = f"Every pixel of the first image '{key}' is {np.max(image)}, nothing can be learned from it"
+                raise ValueError(f"{reason}: {remedy}.")

@@ -16,25 +16,24 @@ from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.utils import LinearSchedule, safe_mean
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
-from sb3_esad.common.checks import require
+from sb3_esad.common.checks import refuse_blank_images, refuse_unknown, require
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.save_util import check_saved_model, whole_file
+from sb3_esad.common.starts import choose_starts
 from sb3_esad.common.torch_layers import LearningModule
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
 
 SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
 
-SETTLING_STEPS = 3
-"""Steps after the start of a window before its states are trusted: speeds are not visible in a single frame."""
-EVENT_HORIZON = 8
-"""Imagination also starts from states at most this many steps before a recorded cost."""
+FALLING_RATE = LinearSchedule(start=0.006, end=0.0, end_fraction=1.0)
+"""A constant rate, large enough to learn, swings between driving too fast and crawling (docs/experiments.md, section 5)."""
 NOT_OFFERED = {
     "use_sde": "gSDE is not offered, pass an action_noise instead",
     "sde_sample_freq": "gSDE is not offered, pass an action_noise instead",
@@ -50,7 +49,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
     :param env: environment with a Box action space
-    :param learning_rate: of all networks, a number or a function of the remaining progress
+    :param learning_rate: of all networks, a number or a function of the remaining progress; falls from 0.006 to 0 by default
     :param buffer_size: number of steps to remember
     :param learning_starts: steps of random actions of random amplitude, each held for ``random_hold`` steps, before learning
     :param batch_size: windows in a batch
@@ -95,7 +94,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         self,
         policy: str | type[LatentPolicy],
         env: GymEnv | str,
-        learning_rate: float | Schedule = 5e-3,
+        learning_rate: float | Schedule = FALLING_RATE,
         buffer_size: int = 100_000,
         learning_starts: int = 1000,
         batch_size: int = 16,
@@ -124,7 +123,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         _init_setup_model: bool = True,
         **unknown: Any,
     ) -> None:
-        _refuse_unknown(type(self).__name__, unknown)
+        refuse_unknown(type(self).__name__, unknown, NOT_OFFERED)
         super().__init__(
             policy,
             env,
@@ -292,16 +291,8 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         assert self._last_obs is not None and self._last_episode_starts is not None
         if self._last_episode_starts.all():
             self._episode_costs.clear()
-        self._refuse_blank_images(self._last_obs)
+        refuse_blank_images(self.policy.world_model.images(self._last_obs))
         return result
-
-    def _refuse_blank_images(self, observations: np.ndarray | dict[str, np.ndarray]) -> None:
-        remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
-        for key, images in self.policy.world_model.images(observations).items():
-            for image in images:
-                if np.max(image) == np.min(image):
-                    reason = f"Every pixel of the first image '{key}' is {np.max(image)}, nothing can be learned from it"
-                    raise ValueError(f"{reason}: {remedy}.")
 
     def train(self, gradient_steps: int, batch_size: int = 16) -> None:
         """
@@ -355,21 +346,12 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         return norm.item()
 
     def _imagine(self, samples: SequenceSamples, filtered: Filtered) -> Imagination:
-        start = self._choose_starts(samples, filtered)
+        start = choose_starts(samples, filtered, self.imagination_starts)
         start = start._replace(action=self._first_actions(start))
         return self.policy.world_model.imagine(start, self.policy.actor, self.imagination_horizon, self.gamma)
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
         return self.policy.actor(self.policy.world_model.features(start))
-
-    def _choose_starts(self, samples: SequenceSamples, filtered: Filtered) -> LatentState:
-        """Half the starts come from uniformly drawn windows, half from shortly before a cost; the former stand first."""
-        eligible = filtered.settled(SETTLING_STEPS, samples.is_first.T)
-        usual = (eligible & samples.uniform).float().flatten()
-        dangerous = (eligible & (samples.time_to_event.T < EVENT_HORIZON)).float().flatten()
-        half = self.imagination_starts // 2
-        chosen = th.cat([_draw(usual, half), _draw(dangerous if dangerous.any() else usual, self.imagination_starts - half)])
-        return filtered.before.map(lambda field: field.flatten(0, 1)[chosen])
 
     def _record(self, logs: dict[str, list[float]]) -> None:
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
@@ -419,15 +401,3 @@ class LatentAlgorithm(OffPolicyAlgorithm):
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]
-
-
-def _refuse_unknown(algorithm: str, arguments: dict[str, Any]) -> None:
-    for name, value in arguments.items():
-        if name in NOT_OFFERED:
-            raise ValueError(f"{algorithm} cannot take {name}={value!r}: {NOT_OFFERED[name]}.")
-        raise TypeError(f"{algorithm} has no argument '{name}'.")
-
-
-def _draw(weights: th.Tensor, n: int) -> th.Tensor:
-    # A batch of very short windows may hold no eligible state at all; any is then better than none
-    return th.multinomial(weights if weights.any() else th.ones_like(weights), n, replacement=True)
