@@ -36,8 +36,8 @@ def esad_lend(seed: int, changes: dict[str, Any]) -> ESADLEND:
     :param changes: arguments of the constructor to replace
     :return: the algorithm
     """
-    arguments = {**load_hyperparams(ESADLEND, "esad_lend", ENV).arguments, **changes}
-    return ESADLEND(env=make_vec_env(ENV), seed=seed, **arguments)
+    hyperparams = load_hyperparams(ESADLEND, "esad_lend", ENV)
+    return ESADLEND(env=make_vec_env(ENV, hyperparams.n_envs), seed=seed, **{**hyperparams.arguments, **changes})
 
 
 def sac(seed: int, changes: dict[str, Any]) -> SAC:

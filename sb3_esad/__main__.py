@@ -94,7 +94,7 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the training (default: %(default)s)")
     parser.add_argument(
-        "--timesteps", type=_positive, default=6000, metavar="N", help="environment steps (default: %(default)s)"
+        "--timesteps", type=_positive, default=13_000, metavar="N", help="environment steps (default: %(default)s)"
     )
     parser.add_argument(
         "--minutes", type=_above_zero, default=7.0, metavar="M", help="of training at most (default: %(default)s)"

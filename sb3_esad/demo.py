@@ -24,7 +24,7 @@ UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
 
-def run_demo(folder: Path, seed: int = 0, timesteps: int = 6000, minutes: float = 7.0, episodes: int = 100) -> None:
+def run_demo(folder: Path, seed: int = 0, timesteps: int = 13_000, minutes: float = 7.0, episodes: int = 100) -> None:
     """
     Train, evaluate beside two simple drivers, and write model, learning curve, results and video into a folder.
 
