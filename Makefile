@@ -12,7 +12,7 @@ demo: $(INSTALLED)
 
 # Two workers, for the tests are many and small; tests/conftest.py gives each of them one thread.
 test: $(INSTALLED)
-	$(BIN)/python -m pytest -n 2 -m "not slow"
+	$(BIN)/python -m pytest -n 2
 
 lint: $(INSTALLED)
 	$(BIN)/ruff check .

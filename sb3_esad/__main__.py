@@ -10,7 +10,7 @@ import torch as th
 from stable_baselines3.common.utils import set_random_seed
 
 from sb3_esad import ESADLEND, __version__
-from sb3_esad.demo import ENV_ID, run_demo
+from sb3_esad.demo import ENV_ID, MINUTES, TIMESTEPS, run_demo
 from sb3_esad.driving_evaluation import DRIVERS, evaluate_driver, evaluate_model
 from sb3_esad.report import format_table, summarise_any, write_json
 from sb3_esad.video import record_driver, record_model
@@ -94,10 +94,10 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the training (default: %(default)s)")
     parser.add_argument(
-        "--timesteps", type=_positive, default=13_000, metavar="N", help="environment steps (default: %(default)s)"
+        "--timesteps", type=_positive, default=TIMESTEPS, metavar="N", help="environment steps (default: %(default)s)"
     )
     parser.add_argument(
-        "--minutes", type=_above_zero, default=7.0, metavar="M", help="of training at most (default: %(default)s)"
+        "--minutes", type=_above_zero, default=MINUTES, metavar="M", help="of training at most (default: %(default)s)"
     )
     parser.add_argument(
         "--episodes", type=_positive, default=100, metavar="N", help="of the evaluation (default: %(default)s)"

@@ -20,11 +20,12 @@ from sb3_esad.report import Figures, format_table, summarise_any
 from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
+TIMESTEPS, MINUTES = 13_000, 7.0
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
 
-def run_demo(folder: Path, seed: int = 0, timesteps: int = 13_000, minutes: float = 7.0, episodes: int = 100) -> None:
+def run_demo(folder: Path, seed: int = 0, timesteps: int = TIMESTEPS, minutes: float = MINUTES, episodes: int = 100) -> None:
     """
     Train, evaluate beside two simple drivers, and write model, learning curve, results and video into a folder.
 
@@ -70,11 +71,10 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESAD
     took = (time.monotonic() - start) / 60
     model.save(folder / "esad_lend.zip")
     plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)
+    clock = "" if model.num_timesteps >= timesteps else ", ended by the clock before the learning rate had fallen to zero"
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
-    return (
-        model,
-        f"Trained for {done} in {took:.1f} minutes with seed {seed}, at most {model.cost_limit} cost per episode wanted.",
-    )
+    wanted = f"at most {model.cost_limit} cost per episode wanted"
+    return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
 
 
 def write_results(path: Path, columns: Mapping[str, Figures], training: str, seeds: range) -> None:

@@ -20,7 +20,9 @@ from sb3_esad import ESADLEND
 from sb3_esad.common.functional import barrier_residual, discounted_budget
 from sb3_esad.common.latents import Gaussian
 from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
+from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, LatentState, Predictions, SequenceSamples
 from sb3_esad.esad_lend.targets import recorded_transitions
@@ -101,6 +103,47 @@ def test_each_update_moves_one_network() -> None:
         for each, vector in before.items():
             same = th.equal(vector, th.nn.utils.parameters_to_vector(getattr(model.policy, each).parameters()))
             assert same == (each != name)
+
+
+def test_critics_do_not_learn_through_the_dream() -> None:
+    model = make_model().learn(24)
+    samples, filtered, imagined = imagine(model)
+    given: list[th.Tensor] = []
+    critic: Any = model.policy.critic
+    loss = critic.loss
+    critic.loss = lambda *args: given.extend(args) or loss(*args)
+    model._update_behavior(samples, filtered, imagined)
+    assert any(field.requires_grad for field in (imagined.grids, imagined.actions, *imagined.predictions))
+    assert given and not any(argument.requires_grad for argument in given)
+
+
+def test_a_network_that_has_just_learned_is_seen_as_it_is() -> None:
+    """Autocast keeps copies of the weights, which the next network would be improved by."""
+    layer: Any = th.nn.Linear(4, 4)
+    layer.optimizer = MuonWithAdam(layer.parameters(), lr=0.5)
+    model = make_model()
+    with autocast(th.device("cpu")):
+        before = layer(th.ones(1, 4))
+        model._step(layer, before.sum())
+        assert not th.equal(layer(th.ones(1, 4)), before)
+
+
+def test_the_rate_falls_to_zero() -> None:
+    model = make_model()
+    assert {group["lr"] for each in model._optimizers().values() for group in each.param_groups} == {0.006}
+    model.learn(40)
+    model.train(1, 4)
+    assert max(group["lr"] for each in model._optimizers().values() for group in each.param_groups) == pytest.approx(
+        0, abs=1e-9
+    )
+
+
+@pytest.mark.parametrize("uniform", [0.0, 1.0])
+def test_a_random_first_action_owes_nothing_to_the_actor(uniform: float) -> None:
+    model = make_model(uniform_action_prob=uniform)
+    model._first_actions(model.policy.initial_state(5)).sum().backward()
+    gradients = [parameter.grad for parameter in model.policy.actor.parameters() if parameter.grad is not None]
+    assert any(gradient.any() for gradient in gradients) == (uniform == 0.0)
 
 
 def test_targets_follow_slowly() -> None:
@@ -198,10 +241,9 @@ def test_without_a_limit_costs_do_not_reach_the_actor(cost_limit: float | None) 
 
 @pytest.mark.parametrize("cost_limit", [None, 0.05])
 def test_the_actor_is_told_what_its_actions_do_to_the_steps_that_follow(
-    cost_limit: float | None, monkeypatch: pytest.MonkeyPatch
+    cost_limit: float | None,
 ) -> None:
     """Its gradient is the slope of its loss, found by moving it a little along the gradient and imagining again."""
-    monkeypatch.setattr("sb3_esad.common.world_model.working_dtype", lambda device: th.float32)
     fixed: dict[str, Any] = {"penalty_coef": 0.0, "ent_coef": 0.0, "max_grad_norm": 1e9, "uniform_action_prob": 0.0}
     model = make_model(cost_limit=cost_limit, **fixed).learn(24)
     world_model: Any = model.policy.world_model

@@ -1,5 +1,6 @@
 """Hyperparameter files: every key is an argument, every entry builds a model, every mistake is named."""
 
+import inspect
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +51,13 @@ def test_every_entry_builds_a_model(name: str, env_id: str) -> None:
     for key, value in arguments.items():
         if key not in ("policy", "policy_kwargs", "replay_buffer_kwargs", "train_freq"):
             assert getattr(model, key) == value
+
+
+@pytest.mark.parametrize(("name", "env_id"), ENTRIES)
+def test_no_entry_repeats_a_default(name: str, env_id: str) -> None:
+    for key, value in load_hyperparams(ALGORITHMS[name], name, env_id).arguments.items():
+        defaults = [inspect.signature(each).parameters.get(key) for each in ALGORITHMS[name].__mro__]
+        assert next(parameter for parameter in defaults if parameter is not None).default != value
 
 
 def test_an_entry_is_preferred_to_the_default(folder: Path) -> None:

@@ -1,5 +1,7 @@
 """Muon for matrices and kernels, Adam for the rest."""
 
+import io
+import pickle
 from copy import deepcopy
 
 import pytest
@@ -84,3 +86,70 @@ def test_a_learning_rate_of_zero_moves_nothing() -> None:
     backward(network)
     optimizer.step()
     assert all(th.equal(before[name], value) for name, value in network.state_dict().items())
+
+
+def test_it_goes_on_where_the_network_was_moved_to_after_loading() -> None:
+    """As with a model that is loaded to a GPU: the network moves first, then the optimiser's state is loaded."""
+    network = small_network()
+    optimizer = MuonWithAdam(network.parameters(), lr=0.01)
+    backward(network)
+    optimizer.step()
+    moved = small_network()
+    successor = MuonWithAdam(moved.parameters(), lr=0.01)
+    moved.double()
+    successor.load_state_dict(optimizer.state_dict())
+    for parameter in moved.parameters():
+        parameter.grad = th.randn_like(parameter)
+    successor.step()
+    assert all(parameter.dtype == th.float64 and parameter.isfinite().all() for parameter in moved.parameters())
+
+
+def test_a_copy_of_a_network_has_an_optimiser_of_its_own() -> None:
+    network = small_network()
+    network.optimizer = MuonWithAdam(network.parameters(), lr=0.01)  # type: ignore[assignment]
+    backward(network)
+    network.optimizer.step()  # type: ignore[union-attr, operator]
+    stored = io.BytesIO()
+    pickle.dump(network, stored)
+    before = deepcopy(network.state_dict())
+    for copy in (deepcopy(network), pickle.loads(stored.getvalue())):
+        backward(copy, 1)
+        copy.optimizer.step()
+        assert all(th.equal(before[name], value) for name, value in network.state_dict().items())
+        assert not any(th.equal(before[name], value) for name, value in copy.state_dict().items())
+
+
+def test_what_has_no_gradient_stays() -> None:
+    matrix, bias = nn.Parameter(th.ones(16, 16)), nn.Parameter(th.ones(3))
+    optimizer = MuonWithAdam([matrix, bias], lr=0.1)
+    bias.grad = th.ones(3)
+    optimizer.step()
+    assert (matrix == 1).all() and (bias < 1).all()
+
+
+@pytest.mark.parametrize(("shape", "muon"), [((15, 40), False), ((40, 15), False), ((16, 16), True), ((16,), False)])
+def test_small_layers_are_left_to_adam(shape: tuple[int, ...], muon: bool) -> None:
+    (part,) = MuonWithAdam([nn.Parameter(th.ones(shape))], lr=0.1).parts
+    assert isinstance(part, th.optim.Muon if muon else th.optim.Adam)
+
+
+def test_a_closure_computes_the_gradient() -> None:
+    bias = nn.Parameter(th.ones(3))
+    optimizer = MuonWithAdam([bias], lr=0.1)
+
+    def closure() -> float:
+        loss = bias.square().sum()
+        loss.backward()
+        return loss.item()
+
+    assert optimizer.step(closure) == 3.0
+    assert (bias < 1).all()
+
+
+def test_other_groups_and_other_states_are_refused() -> None:
+    optimizer = MuonWithAdam([nn.Parameter(th.ones(3))], lr=0.1)
+    with pytest.raises(ValueError, match="one group of parameters"):
+        optimizer.add_param_group({"params": [nn.Parameter(th.ones(3))]})
+    adam = th.optim.Adam([nn.Parameter(th.ones(3))])
+    with pytest.raises(ValueError, match="no state of MuonWithAdam: use the optimizer_class"):
+        optimizer.load_state_dict(adam.state_dict())

@@ -56,7 +56,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
     :param sequence_length: steps in a window
     :param tau: share of the learned networks in their targets at each update
     :param gamma: discount
-    :param train_freq: environment steps between updates
+    :param train_freq: steps of each environment between updates
     :param gradient_steps: updates each time; -1 for as many as steps were made
     :param action_noise: added to the actions while training
     :param replay_buffer_class: a :class:`SequenceReplayBuffer`
@@ -343,6 +343,7 @@ class LatentAlgorithm(OffPolicyAlgorithm):
         loss.backward(inputs=parameters)
         norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         network.optimizer.step()
+        th.clear_autocast_cache()  # it holds the weights as they were, and the next network would be improved by old ones
         return norm.item()
 
     def _imagine(self, samples: SequenceSamples, filtered: Filtered) -> Imagination:

@@ -54,7 +54,7 @@ class Penalty(nn.Module, ABC):
     def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
         """
         :param objective: what the actor minimises apart from safety
-        :param risk: Gamma(s, a), of the same shape
+        :param risk: Gamma of each imagined step, of the same shape
         :param barrier: residual of the barrier condition, of the same shape
         :return: the loss of the actor, of the same shape
         """
@@ -93,7 +93,7 @@ class Penalty(nn.Module, ABC):
         """
         Move the multiplier.
 
-        :param violation: mean of Gamma - d over replayed states, None if the actor has not been updated since the last call
+        :param violation: mean of Gamma - d over the states visited since the last call, None if there is none
         :param gradient_steps: number of updates since the last call
         :return: values to log
         """

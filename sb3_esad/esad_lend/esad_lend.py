@@ -39,8 +39,9 @@ class ESADLEND(LatentAlgorithm):
     """
     Enhanced Safety in Autonomous Driving: Latent State Diffusion Model for End-to-End Navigation (arXiv 2407.06317).
 
-    A soft actor-critic learns in the imagination of a world model. Cost critics predict mean and variance of the cost to
-    come; an augmented Lagrangian keeps their conditional value at risk within a budget.
+    The actor follows the gradient of imagined return and risk through the steps of a world model, as Dreamer's (arXiv
+    1912.01603). Cost critics predict mean and variance of the cost to come; an augmented Lagrangian keeps their conditional
+    value at risk within a budget.
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
     :param env: environment with a Box action space, whose info dict holds a cost in [0, 1]
@@ -261,9 +262,10 @@ class ESADLEND(LatentAlgorithm):
         objective = self.entropy() * log_prob.view_as(returns) - returns / self.policy.critic.scale
         loss = (imagined.weights.detach() * self.penalty.combine(objective, risk, barrier)).mean()
         self._step(self.policy.actor, loss)
+        usual_risk = risk[0, : risk.shape[1] // 2]  # the other half starts shortly before a cost
         return {
             "actor_loss": loss.item(),
-            "cvar": risk[:, : risk.shape[1] // 2].mean().item(),
+            "cvar": usual_risk.mean().item(),
             "barrier_residual": barrier.relu().mean().item(),
             "entropy": -log_prob.mean().item(),
             "return_scale": self.policy.critic.scale.item(),
@@ -272,7 +274,7 @@ class ESADLEND(LatentAlgorithm):
 
     def _imagined_risk(self, imagined: Imagination) -> th.Tensor:
         """
-        Safety measure of each imagined step, of shape (H, N).
+        Safety measure of each imagined step, of shape (H, N); :meth:`risk`, which moves the multiplier, is the critics' own.
 
         Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
         from it to crash less often ("blindness to success", arXiv 2205.05138): hence without the bound.
