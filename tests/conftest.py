@@ -14,6 +14,7 @@ th.set_num_threads(1)
 
 TINY: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [16], "memory_channels": 8, "latent_channels": 4},
+    "learning_rate": 1e-3,
     "learning_starts": 20,
     "buffer_size": 1000,
     "batch_size": 4,

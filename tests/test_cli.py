@@ -134,7 +134,8 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     monkeypatch.setattr(demo, "load_hyperparams", lambda *_: Hyperparams(60, 2, {**arguments, "imagination_starts": 8}))
     monkeypatch.setattr(demo, "ENV_ID", SHORT)
     folder = tmp_path / "new" / "demo"
-    assert main(["demo", "--out", str(folder), "--episodes", "2", "--threads", "1", "--seed", "3"]) == 0
+    brief = ["--timesteps", "60", "--episodes", "2"]
+    assert main(["demo", "--out", str(folder), *brief, "--threads", "1", "--seed", "3"]) == 0
     files = {"esad_lend.zip", "learning_curve.png", "results.md", "episode.mp4"}
     assert {path.name for path in folder.iterdir()} == files
     printed, results = capsys.readouterr().out, (folder / "results.md").read_text()

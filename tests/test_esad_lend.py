@@ -18,6 +18,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.functional import barrier_residual, discounted_budget
+from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.latents import Gaussian
 from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
 from sb3_esad.common.optimizers import MuonWithAdam
@@ -129,7 +130,8 @@ def test_a_network_that_has_just_learned_is_seen_as_it_is() -> None:
 
 
 def test_the_rate_falls_to_zero() -> None:
-    model = make_model()
+    model = make_model(learning_rate=FALLING_RATE)
+    assert inspect.signature(ESADLEND.__mro__[1]).parameters["learning_rate"].default is FALLING_RATE
     assert {group["lr"] for each in model._optimizers().values() for group in each.param_groups} == {0.006}
     model.learn(40)
     model.train(1, 4)

@@ -62,7 +62,8 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         uniform_action_prob=0.5,
         tau=0.05,
         ent_coef=0.2,
-        lambda_lr=0.05,
+        lagrangian_multiplier_init=1.0,
+        lambda_lr=0.1,
         penalty_warmup=20,
         buffer_size=10_000,
         policy_kwargs={

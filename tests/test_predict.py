@@ -90,7 +90,7 @@ def test_no_state_is_an_episode_start(policy: str) -> None:
     np.testing.assert_array_equal(fresh, started)
     np.testing.assert_array_equal(fresh, forgotten)
     np.testing.assert_array_equal(goes_on, continued)
-    assert not np.allclose(fresh, continued)
+    assert not np.array_equal(fresh, continued)
 
 
 def test_memory_holds_the_action() -> None:
