@@ -7,7 +7,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.heads import ValueDistribution
-from sb3_esad.common.torch_layers import GridReadout, GridShape, LearningModule, mlp
+from sb3_esad.common.torch_layers import GridReadout, GridShape, LearningModule, dense_block, mlp
 
 MIN_VARIANCE = 1e-4
 Module = TypeVar("Module", bound=nn.Module)
@@ -37,7 +37,7 @@ class StateActionFeatures(nn.Module):
     def __init__(self, grid_shape: GridShape, action_dim: int, units: int) -> None:
         super().__init__()
         self.readout = GridReadout(grid_shape, units)
-        self.embed_action = nn.Sequential(nn.Linear(action_dim, units), nn.LayerNorm(units), nn.SiLU())
+        self.embed_action = dense_block(action_dim, units)
         self.features_dim = 2 * units
 
     def forward(self, grid: th.Tensor, action: th.Tensor) -> th.Tensor:

@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.latents import Gaussian, LatentHead
-from sb3_esad.common.torch_layers import ChannelNorm, GridShape, join, kernel_size, same_conv
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, dense_block, join, kernel_size, same_conv
 from sb3_esad.common.type_aliases import LatentState
 
 Record = TypeVar("Record", LatentState, Gaussian)
@@ -29,7 +29,7 @@ class GridGRU(nn.Module):
         channels = memory_shape[0]
         hidden = 2 * channels
         self.local = same_conv(channels + input_channels, hidden, kernel_size(memory_shape))
-        self.embed_action = nn.Sequential(nn.Linear(action_dim, hidden), nn.LayerNorm(hidden), nn.SiLU())
+        self.embed_action = dense_block(action_dim, hidden)
         self.everywhere = nn.Linear(channels + hidden, hidden)
         self.norm = ChannelNorm(hidden)
         self.gates = nn.Sequential(same_conv(hidden, 3 * channels, 1), ChannelNorm(3 * channels))

@@ -62,6 +62,17 @@ def conv_block(in_channels: int, out_channels: int, kernel: int) -> nn.Sequentia
     return nn.Sequential(same_conv(in_channels, out_channels, kernel), ChannelNorm(out_channels), nn.SiLU())
 
 
+def dense_block(input_dim: int, units: int) -> nn.Sequential:
+    """
+    Build linear layer, normalisation and activation.
+
+    :param input_dim: number of inputs
+    :param units: number of outputs
+    :return: the block
+    """
+    return nn.Sequential(nn.Linear(input_dim, units), nn.LayerNorm(units), nn.SiLU())
+
+
 def mlp(input_dim: int, net_arch: Sequence[int], output_dim: int, zero_output: bool = False) -> nn.Sequential:
     """
     Build a perceptron with normalised hidden layers.
@@ -74,7 +85,7 @@ def mlp(input_dim: int, net_arch: Sequence[int], output_dim: int, zero_output: b
     """
     layers: list[nn.Module] = []
     for units in net_arch:
-        layers += [nn.Linear(input_dim, units), nn.LayerNorm(units), nn.SiLU()]
+        layers += dense_block(input_dim, units)
         input_dim = units
     output = nn.Linear(input_dim, output_dim)
     if zero_output:
