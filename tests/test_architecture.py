@@ -12,13 +12,15 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # From the lowest to the highest; a module may import those of its own and of lower layers.
 LAYERS = [
-    "common.type_aliases common.functional common.torch_layers common.precision common.checks common.memory common.optimizers",
-    "common.costs common.frames common.windows common.buffers common.episode_record common.multipliers common.entropy",
+    "common.type_aliases common.functional common.transforms common.torch_layers common.optimizers",
+    "common.precision common.checks common.memory",
+    "common.costs common.frames common.windows common.buffers",
+    "common.episode_record common.penalties common.multipliers common.entropy",
     "common.latents common.extractors common.decoders common.heads common.actor",
     "common.rssm common.diffusion",
     "common.world_model common.critics common.selection common.starts",
     "common.policies common.callbacks common.evaluation common.save_util",
-    "common.latent_algorithm",
+    "common.recurrent_algorithm common.latent_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",
     "",  # the package itself, which re-exports
     "driving_evaluation report dream panels progress hyperparams",

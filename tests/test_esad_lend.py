@@ -20,8 +20,9 @@ from sb3_esad import ESADLEND
 from sb3_esad.common.functional import barrier_residual, discounted_budget
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.latents import Gaussian
-from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
+from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.optimizers import MuonWithAdam
+from sb3_esad.common.penalties import NoPenalty
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered

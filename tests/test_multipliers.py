@@ -10,7 +10,8 @@ import torch as th
 from sb3_esad.common.entropy import FixedCoefficient, LearnedCoefficient, make_entropy_coefficient
 from sb3_esad.common.episode_record import EpisodeRecord
 from sb3_esad.common.functional import discounted_budget
-from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty
+from sb3_esad.common.multipliers import AugmentedLagrangian
+from sb3_esad.common.penalties import NoPenalty
 
 
 def make_penalty(**kwargs: Any) -> AugmentedLagrangian:

@@ -6,8 +6,8 @@ from abc import ABC, abstractmethod
 import torch as th
 from torch import nn
 
-from sb3_esad.common.functional import symexp, symlog
 from sb3_esad.common.torch_layers import GridReadout, GridShape, conv_block
+from sb3_esad.common.transforms import symexp, symlog
 
 FOREGROUND_CONTRAST = 0.1
 MEDIAN_SAMPLE = 32

@@ -8,8 +8,8 @@ from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_ima
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from torch import nn
 
-from sb3_esad.common.functional import symlog
 from sb3_esad.common.torch_layers import ChannelNorm, GridShape, mlp
+from sb3_esad.common.transforms import symlog
 
 MIN_PIXELS = 16
 

@@ -4,8 +4,9 @@ import torch as th
 from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
-from sb3_esad.common.functional import correct_logit, symexp, twohot_decode, twohot_encode
+from sb3_esad.common.functional import correct_logit
 from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
+from sb3_esad.common.transforms import symexp, twohot_decode, twohot_encode
 from sb3_esad.common.type_aliases import Logs, Predictions
 
 

@@ -16,7 +16,8 @@ from sb3_esad.common.checks import require
 from sb3_esad.common.entropy import make_entropy_coefficient
 from sb3_esad.common.functional import barrier_residual, capped_cvar, tail_factor
 from sb3_esad.common.latent_algorithm import LatentAlgorithm
-from sb3_esad.common.multipliers import AugmentedLagrangian, NoPenalty, Penalty
+from sb3_esad.common.multipliers import AugmentedLagrangian
+from sb3_esad.common.penalties import NoPenalty, Penalty
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples

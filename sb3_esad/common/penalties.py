@@ -1,0 +1,126 @@
+"""How a cost limit enters learning and acting, and the absence of one."""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+import torch as th
+from torch import nn
+
+from sb3_esad.common.type_aliases import Logs
+
+
+class Penalty(nn.Module, ABC):
+    """How a cost limit enters the actor's loss and the choice of actions."""
+
+    @property
+    @abstractmethod
+    def budget(self) -> float:
+        """d, the discounted cost that is allowed."""
+
+    @property
+    @abstractmethod
+    def budget_scale(self) -> float:
+        """d_s > 0, by which violations are normalised."""
+
+    @property
+    @abstractmethod
+    def calibration(self) -> float:
+        """Predicted over observed discounted cost of an episode."""
+
+    @property
+    @abstractmethod
+    def calibrated(self) -> bool:
+        """Whether the predictions may be trusted."""
+
+    @abstractmethod
+    def forward(self, violation: th.Tensor) -> th.Tensor:
+        """
+        :param violation: Gamma - d, <= 0 where the limit is kept
+        :return: psi, the penalty of the violation, of the same shape
+        """
+
+    @abstractmethod
+    def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        """
+        :param objective: what the actor minimises apart from safety
+        :param risk: Gamma of each imagined step, of the same shape
+        :param barrier: residual of the barrier condition, of the same shape
+        :return: the loss of the actor, of the same shape
+        """
+
+    @abstractmethod
+    def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        """
+        :param risk: estimated Gamma of candidate actions
+        :param barrier: residual of the barrier condition, of the same shape
+        :return: bool, whether each candidate may be executed
+        """
+
+    @abstractmethod
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        """
+        Take note of one step of the environments.
+
+        :param costs: (n_envs,)
+        :param dones: (n_envs,)
+        """
+
+    @abstractmethod
+    def forget_unfinished(self) -> None:
+        """Drop the episodes under way, for the environments have been reset."""
+
+    @abstractmethod
+    def note_prediction(self, values: th.Tensor) -> None:
+        """
+        Take note of what the critic expects of whole episodes.
+
+        :param values: Q^c(s_0, pi(s_0)) at episode starts, may be empty
+        """
+
+    @abstractmethod
+    def update(self, violation: float | th.Tensor | None, gradient_steps: int = 1) -> Logs:
+        """
+        Move the multiplier.
+
+        :param violation: mean of Gamma - d over the states visited since the last call, None if there is none
+        :param gradient_steps: number of updates since the last call
+        :return: values to log
+        """
+
+
+class NoPenalty(Penalty):
+    """
+    The absence of a limit: nothing is penalised, everything is admissible.
+
+    :param settings: those of :class:`AugmentedLagrangian`, so that either can be built by the same call; ignored
+    """
+
+    budget = 0.0
+    budget_scale = 1.0
+    calibration = 1.0
+    calibrated = True
+
+    def __init__(self, **settings: Any) -> None:
+        super().__init__()
+
+    def forward(self, violation: th.Tensor) -> th.Tensor:
+        return th.zeros_like(violation)  # not 0 * violation: nan must not leak
+
+    def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        return objective
+
+    def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
+        return th.ones_like(risk, dtype=th.bool)
+
+    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        pass
+
+    def forget_unfinished(self) -> None:
+        pass
+
+    def note_prediction(self, values: th.Tensor) -> None:
+        pass
+
+    def update(self, violation: float | th.Tensor | None, gradient_steps: int = 1) -> Logs:
+        return {}

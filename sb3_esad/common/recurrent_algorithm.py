@@ -1,0 +1,273 @@
+"""An off-policy algorithm whose policy remembers, and whose every step may have a cost."""
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, TypeVar
+
+import numpy as np
+import torch as th
+from gymnasium import spaces
+from stable_baselines3.common.buffers import ReplayBuffer
+from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.noise import ActionNoise
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import safe_mean
+
+from sb3_esad.common.buffers import SequenceReplayBuffer
+from sb3_esad.common.checks import refuse_blank_images, refuse_unknown, require
+from sb3_esad.common.costs import EpisodeCosts
+from sb3_esad.common.memory import keep_freed_memory
+from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.save_util import check_saved_model, whole_file
+from sb3_esad.common.type_aliases import LatentState
+
+SelfRecurrent = TypeVar("SelfRecurrent", bound="RecurrentOffPolicyAlgorithm")
+
+NOT_OFFERED = {
+    "use_sde": "gSDE is not offered, pass an action_noise instead",
+    "sde_sample_freq": "gSDE is not offered, pass an action_noise instead",
+    "use_sde_at_warmup": "gSDE is not offered, set random_hold instead",
+    "n_steps": "n-step returns are mixed by lambda_return instead",
+}
+"""Arguments that other algorithms of SB3 have, and what to do without them."""
+
+
+class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
+    """
+    SB3's off-policy algorithm with what it lacks: a memory between two actions, windows of steps to learn from, and costs.
+
+    :param policy: a :class:`LatentPolicy`, or the alias of one
+    :param env: environment with a Box action space
+    :param learning_rate: of all networks, a number or a function of the remaining progress
+    :param buffer_size: number of steps to remember
+    :param learning_starts: steps of random actions of random amplitude, each held for ``random_hold`` steps, before learning
+    :param batch_size: windows in a batch
+    :param sequence_length: steps in a window
+    :param tau: share of the learned networks in their targets at each update
+    :param gamma: discount
+    :param train_freq: steps of each environment between updates
+    :param gradient_steps: updates each time; -1 for as many as steps were made
+    :param action_noise: added to the actions while training
+    :param replay_buffer_class: a :class:`SequenceReplayBuffer`
+    :param replay_buffer_kwargs: its further arguments
+    :param optimize_memory_usage: must be False: frames are stored once anyway
+    :param random_hold: steps for which a random action of the warm-up is held
+    :param cost_key: key of the cost in the info dict; the cost of a step lies in [0, 1]
+    :param policy_kwargs: further arguments of the policy
+    :param stats_window_size: episodes over which the log averages
+    :param tensorboard_log: where to write TensorBoard logs
+    :param verbose: 0 silent, 1 info, 2 debug
+    :param device: where to compute
+    :param seed: of all random numbers
+    :param _init_setup_model: whether to build the networks at once
+    :param unknown: refused; arguments of other SB3 algorithms with what to use instead
+    :raises ValueError: if an argument is out of its range
+    """
+
+    policy: LatentPolicy
+    replay_buffer: SequenceReplayBuffer
+    action_space: spaces.Box
+    _last_latent: LatentState | None
+
+    def __init__(
+        self,
+        policy: str | type[LatentPolicy],
+        env: GymEnv | str,
+        learning_rate: float | Schedule,
+        buffer_size: int = 100_000,
+        learning_starts: int = 1000,
+        batch_size: int = 16,
+        sequence_length: int = 16,
+        tau: float = 0.02,
+        gamma: float = 0.97,
+        train_freq: int | tuple[int, str] = 4,
+        gradient_steps: int = 1,
+        action_noise: ActionNoise | None = None,
+        replay_buffer_class: type[SequenceReplayBuffer] | None = None,
+        replay_buffer_kwargs: dict[str, Any] | None = None,
+        optimize_memory_usage: bool = False,
+        random_hold: int = 3,
+        cost_key: str = "cost",
+        policy_kwargs: dict[str, Any] | None = None,
+        stats_window_size: int = 100,
+        tensorboard_log: str | None = None,
+        verbose: int = 0,
+        device: th.device | str = "auto",
+        seed: int | None = None,
+        _init_setup_model: bool = True,
+        **unknown: Any,
+    ) -> None:
+        refuse_unknown(type(self).__name__, unknown, NOT_OFFERED)
+        super().__init__(
+            policy,
+            env,
+            learning_rate,
+            buffer_size,
+            learning_starts,
+            batch_size,
+            tau,
+            gamma,
+            train_freq,
+            gradient_steps,
+            action_noise,
+            replay_buffer_class or SequenceReplayBuffer,
+            replay_buffer_kwargs,
+            optimize_memory_usage,
+            policy_kwargs=policy_kwargs,
+            stats_window_size=stats_window_size,
+            tensorboard_log=tensorboard_log,
+            verbose=verbose,
+            device=device,
+            support_multi_env=True,
+            seed=seed,
+            sde_support=False,
+        )
+        self._check_action_space()
+        self.sequence_length = sequence_length
+        self.random_hold = random_hold
+        self.cost_key = cost_key
+        self.total_cost = 0.0
+        if _init_setup_model:
+            self._setup_model()
+
+    def _check_action_space(self) -> None:
+        if self.env is None:
+            return  # as in load: the spaces are those of the saved model
+        remedy = "with highway-env, configure its action as {'type': 'ContinuousAction'}, or wrap the environment"
+        message = f"{type(self).__name__} needs a Box of actions, not {self.action_space}: {remedy}."
+        assert isinstance(self.action_space, spaces.Box), message
+
+    def _check_arguments(self) -> None:
+        require(self.batch_size >= 1, "batch_size", self.batch_size, "a number of windows >= 1")
+        require(0 < self.tau <= 1, "tau", self.tau, "a share in (0, 1]")
+        require(0 <= self.gamma <= 1, "gamma", self.gamma, "a discount in [0, 1]")
+        require(self.random_hold >= 1, "random_hold", self.random_hold, "a number of steps >= 1")
+        buffer_class: Any = self.replay_buffer_class
+        fitting = issubclass(buffer_class, SequenceReplayBuffer)
+        require(fitting, "replay_buffer_class", buffer_class.__name__, "a SequenceReplayBuffer, which returns windows")
+
+    def _setup_model(self) -> None:
+        self._check_arguments()
+        self.replay_buffer_kwargs = {
+            **self.replay_buffer_kwargs,
+            "sequence_length": self.sequence_length,
+            "cost_key": self.cost_key,
+        }
+        super()._setup_model()
+        keep_freed_memory()
+        self._last_latent = None
+        self._random_actions: np.ndarray | None = None
+        self._episode_costs = EpisodeCosts()
+
+    # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
+
+    def _sample_action(
+        self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
+    ) -> tuple[np.ndarray, np.ndarray]:
+        latent = self._filter_last_observation(n_envs)
+        if self.num_timesteps < learning_starts:
+            scaled = self._held_random_actions(n_envs)
+        else:
+            scaled = self.policy.act(latent).cpu().numpy()
+        if action_noise is not None:
+            scaled = np.clip(scaled + np.reshape(action_noise(), scaled.shape), -1, 1).astype(np.float32)
+        # The memory must hold the action that is executed, or it would learn from a world that did not happen
+        self._last_latent = latent._replace(action=th.as_tensor(scaled, device=self.device))
+        shaped = scaled.reshape(n_envs, *self.action_space.shape)
+        return self.policy.unscale_action(shaped).astype(self.action_space.dtype), shaped
+
+    def _filter_last_observation(self, n_envs: int) -> LatentState:
+        starts = self._last_episode_starts
+        if self._last_latent is None or starts is None:
+            starts, self._last_latent = np.ones(n_envs, dtype=bool), self.policy.initial_state(n_envs)
+        assert self._last_obs is not None
+        observation, _ = self.policy.obs_to_tensor(self._last_obs)
+        return self.policy.filter(observation, self._last_latent, th.as_tensor(starts, device=self.device), False)
+
+    def _held_random_actions(self, n_envs: int) -> np.ndarray:
+        if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:
+            actions = np.stack([self.action_space.sample() for _ in range(n_envs)])
+            scaled = self.policy.scale_action(actions).reshape(n_envs, -1)
+            # With a random amplitude: full strokes alone would end every episode within seconds and show little of the world
+            self._random_actions = (np.random.rand(n_envs, 1) * scaled).astype(np.float32)
+        return self._random_actions
+
+    def _store_transition(
+        self,
+        replay_buffer: ReplayBuffer,
+        buffer_action: np.ndarray,
+        new_obs: np.ndarray | dict[str, np.ndarray],
+        reward: np.ndarray,
+        dones: np.ndarray,
+        infos: list[dict[str, Any]],
+    ) -> None:
+        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
+        self._last_episode_starts = dones
+
+    # Logging: what an episode costs stands beside what it earns
+
+    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
+        assert dones is not None
+        costs = self.replay_buffer.read_costs(infos)
+        self.total_cost += float(costs.sum())
+        for episode in self._episode_costs.add(costs, dones):
+            infos[episode.env].get("episode", {})["c"] = episode.cost
+        super()._update_info_buffer(infos, dones)
+
+    def dump_logs(self) -> None:
+        """Write the log, costs included."""
+        costs = [info["c"] for info in self.ep_info_buffer or [] if "c" in info]
+        if costs:
+            self.logger.record("rollout/ep_cost_mean", safe_mean(costs))
+        self.logger.record("rollout/total_cost", self.total_cost)
+        self.logger.record("rollout/cost_rate", self.total_cost / max(self.num_timesteps, 1))
+        super().dump_logs()
+
+    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        result = super()._setup_learn(*args, **kwargs)
+        if self.num_timesteps == 0:
+            self.total_cost = 0.0
+        assert self._last_obs is not None and self._last_episode_starts is not None
+        if self._last_episode_starts.all():
+            self._episode_costs.clear()
+        refuse_blank_images(self.policy.world_model.images(self._last_obs))
+        return result
+
+    # Saving
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save the model to a zip that is there as a whole or not at all.
+
+        :param path: where to; ``.zip`` is added to a path without a suffix
+        :param exclude: attributes to leave out beside the usual ones
+        :param include: attributes to save although they are usually left out
+        """
+        with whole_file(path, ".zip") as target:
+            super().save(target, exclude, include)
+
+    @classmethod
+    def load(
+        cls: type[SelfRecurrent], path: str | pathlib.Path | io.BufferedIOBase, *args: Any, **kwargs: Any
+    ) -> SelfRecurrent:
+        """
+        Load a saved model.
+
+        :param path: its zip; ``.zip`` may be left out
+        :param args: see SB3's ``BaseAlgorithm.load``
+        :param kwargs: likewise
+        :return: the model
+        :raises ValueError: if the file is missing, damaged or holds something else
+        """
+        check_saved_model(path, cls.__name__, mark="random_hold")
+        return super().load(path, *args, **kwargs)
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]
