@@ -26,6 +26,7 @@ from sb3_esad.hyperparams import load_hyperparams
 
 ENV = "esad-highway-v0"
 UNSEEN = 2_000_000
+"""First seed of the evaluation; tune on others (--unseen)."""
 
 
 def esad_lend(seed: int, changes: dict[str, Any]) -> ESADLEND:
@@ -82,12 +83,12 @@ class LearningCurve(BaseCallback):
 
     :param path: file to which lines of JSON are appended
     :param every: environment steps
-    :param episodes: of each evaluation
+    :param seeds: of the episodes of each evaluation
     """
 
-    def __init__(self, path: Path, every: int, episodes: int) -> None:
+    def __init__(self, path: Path, every: int, seeds: range) -> None:
         super().__init__()
-        self.path, self.every, self.episodes = path, every, episodes
+        self.path, self.every, self.seeds = path, every, seeds
 
     def _on_training_start(self) -> None:
         self._next, self._seconds, self._resumed, self._cost = self.every, 0.0, time.monotonic(), 0.0
@@ -102,10 +103,9 @@ class LearningCurve(BaseCallback):
         return True
 
     def _evaluate(self) -> None:
-        seeds = range(UNSEEN, UNSEEN + self.episodes)
         line = {"steps": self.num_timesteps, "seconds": round(self._seconds), "training_cost": self._cost}
         for name, deterministic in (("best", True), ("sampled", False)):
-            line[name] = summary(evaluate_model(self.model, ENV, seeds, deterministic))
+            line[name] = summary(evaluate_model(self.model, ENV, self.seeds, deterministic))
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
         self.model.save(self.path.with_suffix(".zip"))
@@ -120,6 +120,7 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=1500)
     parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--unseen", type=int, default=UNSEEN, help="first seed of the evaluation")
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--set", type=json.loads, default={}, help="JSON of constructor arguments to replace")
@@ -128,7 +129,8 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{args.algorithm}_{args.seed}.jsonl"
     path.unlink(missing_ok=True)
-    ALGORITHMS[args.algorithm](args.seed, args.set).learn(args.steps, callback=LearningCurve(path, args.every, args.episodes))
+    curve = LearningCurve(path, args.every, range(args.unseen, args.unseen + args.episodes))
+    ALGORITHMS[args.algorithm](args.seed, args.set).learn(args.steps, callback=curve)
 
 
 if __name__ == "__main__":

@@ -42,7 +42,7 @@ class DreamingDriver:
         arrays = zip(self._memory, policy.initial_state(1), strict=True)
         self._state = LatentState(*(th.as_tensor(array[0], device=policy.device).view_as(zeros) for array, zeros in arrays))
         self.blind_steps = (self.blind_steps + 1) % self.dream_length
-        dream = policy.world_model.rssm.imagine(self._dream) if self.blind_steps else self._state
+        dream = policy.world_model_target.rssm.imagine(self._dream) if self.blind_steps else self._state
         self._dream = dream._replace(action=self._state.action)
         return action
 
@@ -53,7 +53,7 @@ class DreamingDriver:
 
         :return: preprocessed observations by key, of shape (1, ...)
         """
-        return self.model.policy.world_model.reconstruct(self._state)
+        return self.model.policy.world_model_target.reconstruct(self._state)
 
     @th.no_grad()
     def dream(self) -> dict[str, th.Tensor]:
@@ -62,7 +62,7 @@ class DreamingDriver:
 
         :return: preprocessed observations by key, of shape (1, ...)
         """
-        return self.model.policy.world_model.reconstruct(self._dream)
+        return self.model.policy.world_model_target.reconstruct(self._dream)
 
     @th.no_grad()
     def risk(self) -> float:
@@ -71,4 +71,4 @@ class DreamingDriver:
 
         :return: Gamma, to be compared with ``model.penalty.budget``
         """
-        return self.model.risk(self.model.policy.world_model.features(self._state), self._state.action).item()
+        return self.model.risk(self.model.policy.world_model_target.features(self._state), self._state.action).item()

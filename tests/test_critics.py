@@ -6,8 +6,9 @@ from typing import Any, cast
 import pytest
 import torch as th
 
-from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, QEnsemble, make_target
+from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, QEnsemble
 from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.target_networks import make_target, update_target
 from sb3_esad.common.type_aliases import Imagination, Predictions
 from sb3_esad.esad_lend.targets import (
     CostTargets,
@@ -154,6 +155,19 @@ def test_targets_have_no_gradient() -> None:
         recorded_return_targets(rewards, record, GAMMA),
     ]
     assert not any(target.requires_grad for target in targets)
+
+
+def test_targets_are_averages_whose_buffers_are_up_to_date() -> None:
+    critic = CostCritic(SHAPE, 1, [8])
+    target = make_target(critic)
+    bias = target.means[0][-1].bias
+    assert bias.item() == -4.0
+    critic.raise_bound(2.0)
+    with th.no_grad():
+        critic.means[0][-1].bias.fill_(6.0)
+    update_target(critic, target, 0.1)
+    assert bias.item() == pytest.approx(0.9 * -4.0 + 0.1 * 6.0)
+    assert target.bound.item() == 2.0
 
 
 def test_target_networks_are_frozen_copies() -> None:

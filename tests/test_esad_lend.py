@@ -26,6 +26,7 @@ from sb3_esad.common.penalties import NoPenalty
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.target_networks import make_target
 from sb3_esad.common.type_aliases import Imagination, LatentState, Predictions, SequenceSamples
 from sb3_esad.esad_lend.targets import recorded_transitions
 from tests.conftest import TINY, CountingEnv
@@ -124,10 +125,26 @@ def test_a_network_that_has_just_learned_is_seen_as_it_is() -> None:
     layer: Any = th.nn.Linear(4, 4)
     layer.optimizer = MuonWithAdam(layer.parameters(), lr=0.5)
     model = make_model()
+    model.policy.actor, model.policy.actor_target = layer, make_target(layer)
     with autocast(th.device("cpu")):
         before = layer(th.ones(1, 4))
-        model._step(layer, before.sum())
+        model._step("actor", before.sum())
         assert not th.equal(layer(th.ones(1, 4)), before)
+
+
+def test_the_policy_acts_by_the_averages_of_its_networks() -> None:
+    model = make_model(tau=0.25).learn(24)
+    network, target = model.policy.world_model, model.policy.world_model_target
+    before = [parameter.clone() for parameter in target.parameters()]
+    model._update_world_model(model._sample(4))
+    for old, average, learned in zip(before, target.parameters(), network.parameters(), strict=True):
+        th.testing.assert_close(average, 0.75 * old + 0.25 * learned)
+    observation = np.array(model.observation_space.sample())
+    expected, _ = model.predict(observation, deterministic=True)
+    for learner in (network, model.policy.actor):
+        for parameter in learner.parameters():
+            th.nn.init.constant_(parameter, th.nan)
+    np.testing.assert_array_equal(model.predict(observation, deterministic=True)[0], expected)
 
 
 def test_the_rate_falls_to_zero() -> None:

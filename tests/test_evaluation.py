@@ -171,7 +171,9 @@ def test_dream_starts_from_the_memory_and_goes_on_alone(model: ESADLEND) -> None
         th.testing.assert_close(dream.action, th.as_tensor(action)[None])
         assert th.equal(dream.memory, state.memory) == (step % 3 == 0)
         if step % 3:
-            th.testing.assert_close(dream.memory, model.policy.world_model.rssm.advance(dreams[-1]), msg="it sees nothing")
+            th.testing.assert_close(
+                dream.memory, model.policy.world_model_target.rssm.advance(dreams[-1]), msg="it sees nothing"
+            )
         dreams.append(dream)
     assert 0 <= driver.risk() <= 1
     assert driver.reconstruction()["observation"].shape == driver.dream()["observation"].shape == (1, 3, 64, 64)

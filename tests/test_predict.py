@@ -24,7 +24,7 @@ def make_model(policy: str, **kwargs: Any) -> ESADLEND:
 
 def excite(model: ESADLEND) -> None:
     """Untrained actors do the same whatever they see; let this one act by what it sees."""
-    *_, output_weight, _ = model.policy.actor.parameters()
+    *_, output_weight, _ = model.policy.actor_target.parameters()
     th.nn.init.normal_(output_weight)
 
 
@@ -195,7 +195,7 @@ def test_actions_are_in_the_units_of_the_environment() -> None:
     low, high = np.array([[-3, 0], [10, -1]], np.float32), np.array([[5, 0.1], [20, 1]], np.float32)
     space = spaces.Box(low, high)
     model = ESADLEND("MlpPolicy", RandomEnv(VECTOR, space), **TINY)
-    *_, output_bias = model.policy.actor.parameters()
+    *_, output_bias = model.policy.actor_target.parameters()
     output_bias.data[:4] = th.tensor([9.0, -9.0, 0.0, 9.0])
     action, _ = model.predict(VECTOR.sample(), deterministic=True)
     np.testing.assert_allclose(action, [[5.0, 0.0], [15.0, 1.0]], atol=1e-4)

@@ -1,8 +1,5 @@
 """Critics on latent states: an ensemble for the reward, mean and variance for the cost."""
 
-from copy import deepcopy
-from typing import TypeVar
-
 import torch as th
 from torch import nn
 
@@ -10,17 +7,6 @@ from sb3_esad.common.heads import ValueDistribution
 from sb3_esad.common.torch_layers import GridReadout, GridShape, LearningModule, dense_block, mlp
 
 MIN_VARIANCE = 1e-4
-Module = TypeVar("Module", bound=nn.Module)
-
-
-def make_target(network: Module) -> Module:
-    """
-    Copy a network as the slowly moving target of its own learning.
-
-    :param network: the network that learns
-    :return: a copy without gradients, in evaluation mode
-    """
-    return deepcopy(network).requires_grad_(False).eval()
 
 
 class StateActionFeatures(nn.Module):

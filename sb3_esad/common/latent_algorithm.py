@@ -16,7 +16,7 @@ from sb3_esad.common.precision import autocast
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.starts import choose_starts
-from sb3_esad.common.torch_layers import LearningModule
+from sb3_esad.common.target_networks import update_target
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
 
 SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
@@ -139,17 +139,19 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
         with autocast(self.device):
             loss, filtered, logs = self.policy.world_model.loss(samples)
-        logs["model_grad_norm"] = self._step(self.policy.world_model, loss)
+        logs["model_grad_norm"] = self._step("world_model", loss)
         return filtered.detach(), logs
 
-    def _step(self, network: LearningModule, loss: th.Tensor) -> float:
-        """Minimise a loss by one step of one network; whatever else it passed through gets no gradient."""
+    def _step(self, name: str, loss: th.Tensor) -> float:
+        """Minimise a loss by one step of one network, which its target follows; whatever else it passed through stays."""
+        network = getattr(self.policy, name)
         parameters = list(network.parameters())
         network.optimizer.zero_grad()
         loss.backward(inputs=parameters)
         norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
         network.optimizer.step()
         th.clear_autocast_cache()  # it holds the weights as they were, and the next network would be improved by old ones
+        update_target(network, getattr(self.policy, f"{name}_target"), self.tau)
         return norm.item()
 
     def _imagine(self, samples: SequenceSamples, filtered: Filtered) -> Imagination:

@@ -12,12 +12,13 @@ from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_esad.common.actor import Actor
 from sb3_esad.common.checks import require
-from sb3_esad.common.critics import CostCritic, QEnsemble, make_target
+from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
 from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import RSSM
+from sb3_esad.common.target_networks import make_target
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.common.world_model import WorldModel
 
@@ -27,6 +28,9 @@ NumpyState = tuple[np.ndarray, ...]
 class LatentPolicy(BasePolicy):
     """
     World model, actor and critics, with ``predict`` as SB3's recurrent policies have it.
+
+    Each network has a target, its average over the last updates. The policy acts by the targets, for what is learned last
+    swings between driving too fast and crawling, and its average does not (docs/experiments.md, section 6).
 
     :param observation_space: space of the observations
     :param action_space: box of the actions
@@ -94,6 +98,7 @@ class LatentPolicy(BasePolicy):
         self.actor = Actor(grid, rssm.action_dim, self.actor_arch)
         self.critic = QEnsemble(grid, rssm.action_dim, self.critic_arch)
         self.cost_critic = CostCritic(grid, rssm.action_dim, self.critic_arch)
+        self.world_model_target, self.actor_target = make_target(self.world_model), make_target(self.actor)
         self.critic_target, self.cost_critic_target = make_target(self.critic), make_target(self.cost_critic)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # torch's stub does not know the keyword
         for network in (self.world_model, self.actor, self.critic, self.cost_critic):
@@ -145,7 +150,7 @@ class LatentPolicy(BasePolicy):
         """
         kept = state.map(lambda field: field.masked_fill(episode_start.view(-1, *[1] * (field.dim() - 1)), 0.0))
         with autocast(self.device):
-            return self.world_model.filter(kept, observation, deterministic)
+            return self.world_model_target.filter(kept, observation, deterministic)
 
     @th.no_grad()
     def act(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
@@ -157,7 +162,7 @@ class LatentPolicy(BasePolicy):
         :return: actions scaled to [-1, 1], of shape (N, A)
         """
         with autocast(self.device):
-            return self.actor(self.world_model.features(state), deterministic)
+            return self.actor_target(self.world_model_target.features(state), deterministic)
 
     def predict(
         self,

@@ -9,7 +9,6 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
-from stable_baselines3.common.utils import polyak_update
 
 from sb3_esad.common.callbacks import LagrangeCallback, prepend
 from sb3_esad.common.checks import require
@@ -189,9 +188,9 @@ class ESADLEND(LatentAlgorithm):
         :param starts: which environments have just begun an episode, of shape (n_envs,)
         """
         assert self._last_latent is not None
-        grids, actions = self.policy.world_model.features(self._last_latent), self._last_latent.action
+        grids, actions = self.policy.world_model_target.features(self._last_latent), self._last_latent.action
         self._violations.append(self.risk(grids, actions).mean() - self.penalty.budget)
-        means, _ = self.policy.cost_critic(grids, actions)
+        means, _ = self.policy.cost_critic_target(grids, actions)
         self.penalty.note_prediction(means.mean(0)[th.as_tensor(starts, device=self.device).bool()])
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
@@ -202,15 +201,11 @@ class ESADLEND(LatentAlgorithm):
 
     def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
         recorded, fixed = recorded_transitions(self.policy, samples, filtered), imagined.detach()
-        logs = {
+        return {
             **self._update_critic(fixed, recorded),
             **self._update_cost_critic(fixed, recorded),
             **self._update_actor(imagined),
         }
-        for name in ("critic", "cost_critic"):
-            target = getattr(self.policy, f"{name}_target")
-            polyak_update(getattr(self.policy, name).parameters(), target.parameters(), self.tau)
-        return logs
 
     def _update_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
         with th.no_grad():
@@ -220,7 +215,7 @@ class ESADLEND(LatentAlgorithm):
         critic.follow_scale(targets)
         dreamed = (imagined.weights.flatten() * critic.loss(*taken(imagined), targets.flatten())).mean()
         anchored = (recorded.event_weights * critic.loss(recorded.grids, recorded.actions, recorded_targets)).mean()
-        self._step(critic, dreamed + self.replay_critic_coef * anchored)
+        self._step("critic", dreamed + self.replay_critic_coef * anchored)
         return {
             "critic_loss": dreamed.item(),
             "replay_critic_loss": anchored.item(),
@@ -241,7 +236,7 @@ class ESADLEND(LatentAlgorithm):
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
         dreamed = (weights * (mean_loss + variance_loss)).mean()
         anchored = (recorded.event_weights * (anchor_mean_loss + anchor_variance_loss)).mean()
-        self._step(critic, dreamed + self.replay_cost_critic_coef * anchored)
+        self._step("cost_critic", dreamed + self.replay_cost_critic_coef * anchored)
         return {
             "cost_critic_loss": (weights * mean_loss).mean().item(),
             "cost_var_loss": (weights * variance_loss).mean().item(),
@@ -262,7 +257,7 @@ class ESADLEND(LatentAlgorithm):
         barrier = self._barrier(risk.detach())
         objective = self.entropy() * log_prob.view_as(returns) - returns / self.policy.critic.scale
         loss = (imagined.weights.detach() * self.penalty.combine(objective, risk, barrier)).mean()
-        self._step(self.policy.actor, loss)
+        self._step("actor", loss)
         usual_risk = risk[0, : risk.shape[1] // 2]  # the other half starts shortly before a cost
         return {
             "actor_loss": loss.item(),
@@ -286,14 +281,15 @@ class ESADLEND(LatentAlgorithm):
 
     def risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
-        Safety measure Gamma: conditional value at risk of the cost to come, by the more pessimistic critic.
+        Safety measure Gamma: conditional value at risk of the cost to come, by the more pessimistic target critic.
 
         :param grids: features of N states, of shape (N, C, H, W)
         :param actions: their actions, of shape (N, A)
         :return: shape (N,)
         """
-        means, variance = self.policy.cost_critic(grids, actions)
-        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic.bound).max(0).values
+        critic = self.policy.cost_critic_target
+        means, variance = critic(grids, actions)
+        return capped_cvar(means, variance, self.risk_level, critic.bound).max(0).values
 
     def _barrier(self, risk: th.Tensor) -> th.Tensor:
         """Residual at each imagined step, of shape (H, N); the last m steps look too far ahead and count as safe."""
