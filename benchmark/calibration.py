@@ -40,15 +40,15 @@ def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int) -> Visits:
     :param n_envs: environments side by side
     :return: every state after which nothing that matters was cut off
     """
-    env, policy = DummyVecEnv([partial(gym.make, env_id)] * n_envs), model.policy
+    env, policy, agent = DummyVecEnv([partial(gym.make, env_id)] * n_envs), model.policy, model.policy.average
     env.seed(UNSEEN)
     observation, starts, latent = env.reset(), np.ones(n_envs, dtype=bool), policy.initial_state(n_envs)
     rows = []
     for _ in range(n_steps // n_envs):
-        latent = policy.filter(policy.obs_to_tensor(observation)[0], latent, th.as_tensor(starts), False)
-        action = policy.act(latent)
+        latent = agent.filter(policy.obs_to_tensor(observation)[0], latent, th.as_tensor(starts), False)
+        action = agent.act(latent)
         with th.no_grad():
-            means, variance = policy.cost_critic_target(policy.world_model_target.features(latent), action)
+            means, variance = policy.cost_critic_target(agent.world_model.features(latent), action)
         latent = latent._replace(action=action)
         observation, _, starts, infos = env.step(policy.unscale_action(action.numpy()))
         costs = model.replay_buffer.read_costs(infos)

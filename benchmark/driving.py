@@ -12,6 +12,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import gymnasium as gym
 import numpy as np
 import torch as th
 from stable_baselines3 import SAC
@@ -41,16 +42,40 @@ def esad_lend(seed: int, changes: dict[str, Any]) -> ESADLEND:
     return ESADLEND(env=make_vec_env(ENV, hyperparams.n_envs), seed=seed, **{**hyperparams.arguments, **changes})
 
 
+class CostInReward(gym.Wrapper[Any, Any, Any, Any]):
+    """
+    Tells an algorithm that knows no costs about them.
+
+    :param env: environment with a cost
+    :param penalty: what a cost of 1 takes from the reward
+    """
+
+    def __init__(self, env: gym.Env[Any, Any], penalty: float) -> None:
+        super().__init__(env)
+        self.penalty = penalty
+
+    def step(self, action: Any) -> tuple[Any, Any, bool, bool, dict[str, Any]]:
+        """
+        Step the environment.
+
+        :param action: passed on
+        :return: what the environment returns, its reward less the penalty
+        """
+        observation, reward, terminated, truncated, info = self.env.step(action)
+        return observation, float(reward) - self.penalty * info["cost"], terminated, truncated, info
+
+
 def sac(seed: int, changes: dict[str, Any]) -> SAC:
     """
     Build SB3's SAC for images that show speeds in one frame.
 
     :param seed: of the training
-    :param changes: arguments of the constructor to replace
+    :param changes: arguments of the constructor to replace, and ``penalty``, what a cost takes from the reward
     :return: the algorithm
     """
-    arguments: dict[str, Any] = {"buffer_size": 20_000, "batch_size": 128, "gamma": 0.97, "learning_starts": 1000, **changes}
-    return SAC("CnnPolicy", make_vec_env(ENV), seed=seed, **arguments)
+    penalty = {"penalty": changes.pop("penalty", 0.0)}
+    arguments: dict[str, Any] = {"buffer_size": 50_000, "batch_size": 128, "gamma": 0.97, "learning_starts": 1000, **changes}
+    return SAC("CnnPolicy", make_vec_env(ENV, wrapper_class=CostInReward, wrapper_kwargs=penalty), seed=seed, **arguments)
 
 
 ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {"esad_lend": esad_lend, "sac": sac}

@@ -19,6 +19,7 @@ LAYERS = [
     "common.latents common.extractors common.decoders common.heads common.actor",
     "common.rssm common.diffusion",
     "common.world_model common.critics common.selection common.starts",
+    "common.agent",
     "common.policies common.callbacks common.evaluation common.save_util",
     "common.recurrent_algorithm common.latent_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",

@@ -17,6 +17,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_esad import ESADLEND
+from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.functional import barrier_residual, discounted_budget
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.latents import Gaussian
@@ -132,7 +133,7 @@ def test_a_network_that_has_just_learned_is_seen_as_it_is() -> None:
         assert not th.equal(layer(th.ones(1, 4)), before)
 
 
-def test_the_policy_acts_by_the_averages_of_its_networks() -> None:
+def test_predictions_are_those_of_the_averages() -> None:
     model = make_model(tau=0.25).learn(24)
     network, target = model.policy.world_model, model.policy.world_model_target
     before = [parameter.clone() for parameter in target.parameters()]
@@ -392,13 +393,13 @@ def test_memory_starts_afresh_with_each_episode(monkeypatch: pytest.MonkeyPatch)
     env = DummyVecEnv([lambda: CountingEnv(episode_length=5), lambda: CountingEnv(time_limit=3)])
     model = make_model(env)
     starts: list[list[bool]] = []
-    filter_ = model.policy.filter
+    filter_ = LatentAgent.filter
 
-    def spy(observation: Any, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> LatentState:
+    def spy(agent: LatentAgent, obs: Any, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> LatentState:
         starts.append(episode_start.tolist())
-        return filter_(observation, state, episode_start, deterministic)
+        return filter_(agent, obs, state, episode_start, deterministic)
 
-    monkeypatch.setattr(model.policy, "filter", spy)
+    monkeypatch.setattr(LatentAgent, "filter", spy)
     model.learn(24)
     assert [first for first, _ in starts] == [step % 5 == 0 for step in range(12)]
     assert [second for _, second in starts] == [step % 3 == 0 for step in range(12)]

@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_esad import ESADLEND
 from sb3_esad.common import precision
+from sb3_esad.common.target_networks import update_target
 from tests.conftest import SPACES, TINY, VECTOR, CountingEnv, RandomEnv
 
 Observation = Any
@@ -24,8 +25,9 @@ def make_model(policy: str, **kwargs: Any) -> ESADLEND:
 
 def excite(model: ESADLEND) -> None:
     """Untrained actors do the same whatever they see; let this one act by what it sees."""
-    *_, output_weight, _ = model.policy.actor_target.parameters()
+    *_, output_weight, _ = model.policy.actor.parameters()
     th.nn.init.normal_(output_weight)
+    update_target(model.policy.actor, model.policy.actor_target, tau=1.0)
 
 
 def observe(model: ESADLEND, n_envs: int, steps: int) -> list[Observation]:

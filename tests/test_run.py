@@ -17,6 +17,7 @@ from stable_baselines3.common.noise import NormalActionNoise, OrnsteinUhlenbeckA
 from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_esad import ESADLEND
+from sb3_esad.common.agent import LatentAgent
 from tests.conftest import PICTURE, SPACES, TINY, VECTOR, VIEWS, CountingEnv, RandomEnv
 
 
@@ -233,7 +234,7 @@ def test_training_and_evaluation_mode(monkeypatch: pytest.MonkeyPatch) -> None:
     """Layers such as dropout must know whether the model learns or acts."""
     model = ESADLEND("MlpPolicy", CountingEnv(), **TINY)
     modes: dict[str, set[bool]] = {"act": set(), "_update": set()}
-    act, update = model.policy.act, model._update_world_model
+    act, update = LatentAgent.act, model._update_world_model
 
     def spy_act(*args: Any) -> th.Tensor:
         modes["act"].add(model.policy.training)
@@ -243,7 +244,7 @@ def test_training_and_evaluation_mode(monkeypatch: pytest.MonkeyPatch) -> None:
         modes["_update"].add(model.policy.training)
         return update(*args)
 
-    monkeypatch.setattr(model.policy, "act", spy_act)
+    monkeypatch.setattr(LatentAgent, "act", spy_act)
     monkeypatch.setattr(model, "_update_world_model", spy_update)
     model.learn(32)
     model.policy.set_training_mode(True)

@@ -11,12 +11,12 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor, get_act
 from stable_baselines3.common.type_aliases import PyTorchObs, Schedule
 
 from sb3_esad.common.actor import Actor
+from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.checks import require
 from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
 from sb3_esad.common.optimizers import MuonWithAdam
-from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import RSSM
 from sb3_esad.common.target_networks import make_target
 from sb3_esad.common.type_aliases import LatentState
@@ -29,8 +29,9 @@ class LatentPolicy(BasePolicy):
     """
     World model, actor and critics, with ``predict`` as SB3's recurrent policies have it.
 
-    Each network has a target, its average over the last updates. The policy acts by the targets, for what is learned last
-    swings between driving too fast and crawling, and its average does not (docs/experiments.md, section 6).
+    Each network has a target, its average over the last updates. ``predict`` uses the targets, for what is learned last swings
+    between driving too fast and crawling, and its average does not. Training collects steps by the networks that learn, for
+    an average learns too late of its mistakes (docs/experiments.md, section 6).
 
     :param observation_space: space of the observations
     :param action_space: box of the actions
@@ -126,6 +127,16 @@ class LatentPolicy(BasePolicy):
             **{"units": self.critic_arch[0], **self.world_model_kwargs},
         )
 
+    @property
+    def learner(self) -> LatentAgent:
+        """The networks that learn, as they act together."""
+        return LatentAgent(self.world_model, self.actor)
+
+    @property
+    def average(self) -> LatentAgent:
+        """The averages of the networks, as they act together."""
+        return LatentAgent(self.world_model_target, self.actor_target)
+
     def initial_state(self, n_envs: int) -> LatentState:
         """
         Give the memory that an episode starts with.
@@ -134,35 +145,6 @@ class LatentPolicy(BasePolicy):
         :return: zeros
         """
         return self.world_model.initial(n_envs)
-
-    @th.no_grad()
-    def filter(
-        self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool
-    ) -> LatentState:
-        """
-        Take in an observation, forgetting the past where an episode starts.
-
-        :param observation: of shape (N, ...)
-        :param state: the previous state and the executed action
-        :param episode_start: bool, of shape (N,)
-        :param deterministic: take the mean of the latent instead of a sample
-        :return: the present state
-        """
-        kept = state.map(lambda field: field.masked_fill(episode_start.view(-1, *[1] * (field.dim() - 1)), 0.0))
-        with autocast(self.device):
-            return self.world_model_target.filter(kept, observation, deterministic)
-
-    @th.no_grad()
-    def act(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
-        """
-        Choose actions.
-
-        :param state: N states
-        :param deterministic: take the mode instead of a sample
-        :return: actions scaled to [-1, 1], of shape (N, A)
-        """
-        with autocast(self.device):
-            return self.actor_target(self.world_model_target.features(state), deterministic)
 
     def predict(
         self,
@@ -186,8 +168,9 @@ class LatentPolicy(BasePolicy):
         tensor, vectorized = self.obs_to_tensor(observation)
         n_envs = len(next(iter(tensor.values())) if isinstance(tensor, dict) else tensor)
         start = np.zeros(n_envs, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(-1)
-        latent = self.filter(tensor, self._from_numpy(state, n_envs), th.as_tensor(start, device=self.device), deterministic)
-        actions = self.act(latent, deterministic)
+        starts = th.as_tensor(start, device=self.device)
+        latent = self.average.filter(tensor, self._from_numpy(state, n_envs), starts, deterministic)
+        actions = self.average.act(latent, deterministic)
         new_state = tuple(field.flatten(1)[None].cpu().numpy() for field in latent._replace(action=actions))
         unscaled = self.unscale_action(actions.cpu().numpy().reshape(-1, *self.action_space.shape))
         unscaled = unscaled.astype(self.action_space.dtype, copy=False)
@@ -196,7 +179,7 @@ class LatentPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
         start = th.ones(n, dtype=th.bool, device=self.device)
-        return self.act(self.filter(observation, self.initial_state(n), start, deterministic), deterministic)
+        return self.average.act(self.average.filter(observation, self.initial_state(n), start, deterministic), deterministic)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """

@@ -170,7 +170,7 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
         if self.num_timesteps < learning_starts:
             scaled = self._held_random_actions(n_envs)
         else:
-            scaled = self.policy.act(latent).cpu().numpy()
+            scaled = self.policy.learner.act(latent).cpu().numpy()
         if action_noise is not None:
             scaled = np.clip(scaled + np.reshape(action_noise(), scaled.shape), -1, 1).astype(np.float32)
         # The memory must hold the action that is executed, or it would learn from a world that did not happen
@@ -184,7 +184,8 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
             starts, self._last_latent = np.ones(n_envs, dtype=bool), self.policy.initial_state(n_envs)
         assert self._last_obs is not None
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
-        return self.policy.filter(observation, self._last_latent, th.as_tensor(starts, device=self.device), False)
+        episode_start = th.as_tensor(starts, device=self.device)
+        return self.policy.learner.filter(observation, self._last_latent, episode_start, False)
 
     def _held_random_actions(self, n_envs: int) -> np.ndarray:
         if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:

@@ -188,7 +188,7 @@ class ESADLEND(LatentAlgorithm):
         :param starts: which environments have just begun an episode, of shape (n_envs,)
         """
         assert self._last_latent is not None
-        grids, actions = self.policy.world_model_target.features(self._last_latent), self._last_latent.action
+        grids, actions = self.policy.world_model.features(self._last_latent), self._last_latent.action
         self._violations.append(self.risk(grids, actions).mean() - self.penalty.budget)
         means, _ = self.policy.cost_critic_target(grids, actions)
         self.penalty.note_prediction(means.mean(0)[th.as_tensor(starts, device=self.device).bool()])
