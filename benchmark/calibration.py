@@ -55,7 +55,7 @@ def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int) -> Visits:
         cut = [info.get("TimeLimit.truncated", False) for info in infos]
         rows.append((means.mean(0).numpy(), variance.numpy(), costs, starts, np.array(cut)))
     mean, variance, costs, dones, cuts = (np.array(column) for column in zip(*rows, strict=True))
-    to_come, known = cost_to_come(costs, dones, cuts, model.cost_gamma or model.gamma)
+    to_come, known = cost_to_come(costs, dones, cuts, model.gamma if model.cost_gamma is None else model.cost_gamma)
     return Visits(mean[known], variance[known], to_come[known])
 
 

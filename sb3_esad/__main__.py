@@ -73,9 +73,10 @@ def _evaluate(args: argparse.Namespace) -> None:
     else:
         name, how = args.model.name, "stochastic" if args.stochastic else "deterministic"
         model = ESADLEND.load(args.model)
-        set_random_seed(args.seed)
         if args.video:
+            set_random_seed(args.seed)
             record_model(args.video, model, args.env, args.seed, not args.stochastic)
+        set_random_seed(args.seed)  # here, so that the figures are the same with and without a video
         records = evaluate_model(model, args.env, seeds, not args.stochastic)
     figures = summarise_any(records)
     print(

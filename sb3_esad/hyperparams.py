@@ -9,6 +9,8 @@ from typing import Any, NamedTuple
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
+
 RUN_KEYS = ("n_timesteps", "n_envs")
 """Keys of RL Zoo that concern the training and not the algorithm."""
 
@@ -110,6 +112,7 @@ def constructor_arguments(algorithm: type[BaseAlgorithm]) -> set[str]:
     for each in algorithm.__mro__:
         parameters = inspect.signature(each).parameters.values()
         names |= {parameter.name for parameter in parameters if parameter.kind in NAMED}
-        if all(parameter.kind is not Parameter.VAR_KEYWORD for parameter in parameters):
+        passes_on = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters)
+        if not passes_on or each is RecurrentOffPolicyAlgorithm:  # which refuses what it does not name
             break
     return {name for name in names if name != "env" and not name.startswith("_")}

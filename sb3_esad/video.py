@@ -12,7 +12,7 @@ import numpy as np
 
 from sb3_esad.common.save_util import whole_file
 from sb3_esad.dream import DreamingDriver
-from sb3_esad.driving_evaluation import DRIVERS, check_scenario
+from sb3_esad.driving_evaluation import DRIVERS, check_scenario, check_spaces
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.panels import BAD, GOOD, Gauge, Picture, compose, paint
 
@@ -32,6 +32,7 @@ def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, determinis
     :raises ValueError: if the environment is no driving scenario with an image, or not one that the model knows
     """
     env = _make(env_id)
+    check_spaces(model, env, env_id)
     if _image_of(env.observation_space.sample()) is None:
         raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
     write_video(

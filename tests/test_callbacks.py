@@ -15,12 +15,13 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
+from sb3_esad import ESADLEND
 from sb3_esad.common import callbacks as callbacks_module
 from sb3_esad.common.callbacks import CostEvalCallback, LagrangeCallback, prepend
 from sb3_esad.common.costs import CostReader
 from sb3_esad.common.evaluation import evaluate_policy
 from sb3_esad.common.multipliers import AugmentedLagrangian
-from tests.conftest import CountingEnv
+from tests.conftest import TINY, CountingEnv
 
 
 class RecordingPenalty(AugmentedLagrangian):
@@ -249,6 +250,19 @@ def test_without_limit_the_highest_reward_wins(monkeypatch: pytest.MonkeyPatch) 
     callback = CostEvalCallback(DummyVecEnv([CountingEnv]), eval_freq=5, verbose=0)
     make_model().learn(10, callback=callback)
     assert callback.best_mean_reward == 2.0 and isinstance(callback, EvalCallback)
+
+
+def test_cost_of_the_model_is_the_default() -> None:
+    class Crashing(CountingEnv):
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            observation, reward, terminated, truncated, _ = super().step(action)
+            return observation, reward, terminated, truncated, {"crashed": True}
+
+    model = ESADLEND("MlpPolicy", Crashing(episode_length=5), **TINY, cost_key="crashed")
+    callback = CostEvalCallback(Monitor(Crashing(episode_length=5)), eval_freq=4, n_eval_episodes=2, verbose=0)
+    model.learn(4, callback=callback)
+    assert callback.last_mean_cost == 5.0
+    assert evaluate_policy(model, Monitor(Crashing(episode_length=5)), 2)[2] == 5.0
 
 
 def test_limit_of_the_model_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,6 +63,15 @@ def test_evaluate_samples_reproducibly(saved: Path, capsys: pytest.CaptureFixtur
     assert "stochastic" in printed[1][0] and printed[0][1] != printed[1][1]
 
 
+def test_a_video_changes_no_figures(saved: Path, tmp_path: Path) -> None:
+    command = ["evaluate", "--model", str(saved), "--env", SHORT, "--episodes", "2", "--stochastic"]
+    main([*command, "--json", str(tmp_path / "plain.json")])
+    main([*command, "--json", str(tmp_path / "filmed.json"), "--video", str(tmp_path / "a.mp4")])
+    plain, filmed = (json.loads((tmp_path / name).read_text())["records"] for name in ("plain.json", "filmed.json"))
+    assert (tmp_path / "a.mp4").exists() and len(plain) == 2
+    assert filmed == plain
+
+
 @pytest.mark.parametrize("driver", ["reference", "follower", "keeper", "random"])
 def test_evaluate_a_driver(driver: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["evaluate", "--driver", driver, "--env", SHORT, "--episodes", "2", "--video", str(tmp_path / "a.mp4")]) == 0
@@ -101,9 +110,21 @@ def test_evaluate_says_what_is_wrong(
     assert message in printed and printed.startswith("sb3_esad evaluate: ") and printed.count("\n") == 1
 
 
-def test_evaluate_refuses_a_model_of_another_scenario(saved: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert main(["evaluate", "--model", str(saved), "--env", "esad-highway-vector-v0"]) == 2
-    assert "Observations of esad-highway-vector-v0 are" in capsys.readouterr().err
+@pytest.mark.parametrize("options", [[], ["--video", "a.mp4"]], ids=["plain", "filmed"])
+@pytest.mark.parametrize("env_id", ["esad-highway-vector-v0", "esad-highway-dict-v0"])
+def test_evaluate_refuses_a_model_of_another_scenario(
+    env_id: str,
+    options: list[str],
+    saved: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["evaluate", "--model", str(saved), "--env", env_id, *options]) == 2
+    printed = capsys.readouterr().err
+    assert printed.startswith(f"sb3_esad evaluate: Observations of {env_id} are ") and printed.count("\n") == 1
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.parametrize(

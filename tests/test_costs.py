@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sb3_esad.common.costs import CostReader, EpisodeCosts, read_costs
+from sb3_esad.common.costs import CostReader, EpisodeCosts
 
 
 def test_reads_numbers_and_bools() -> None:
@@ -17,10 +17,10 @@ def test_reads_numbers_and_bools() -> None:
         {"cost": np.array(0.25)},
         {"cost": np.False_},
     ]
-    costs = read_costs(infos)
+    costs = CostReader()(infos)
     assert costs.dtype == np.float32
     assert costs.tolist() == [1.0, 1.0, 0.5, 0.25, 0.0]
-    assert read_costs([{"crashed": True, "cost": 0.0}], cost_key="crashed").tolist() == [1.0]
+    assert CostReader("crashed")([{"crashed": True, "cost": 0.0}]).tolist() == [1.0]
 
 
 def test_missing_cost_is_zero_with_one_warning() -> None:
@@ -35,23 +35,23 @@ def test_missing_cost_is_zero_with_one_warning() -> None:
 
 def test_missing_cost_points_to_crashed() -> None:
     with pytest.warns(UserWarning, match='cost_key="crashed"'):
-        read_costs([{"crashed": True}])
+        CostReader()([{"crashed": True}])
 
 
 @pytest.mark.parametrize("cost", [float("nan"), float("inf"), -1.0, [1.0], np.zeros(2), np.zeros(1), "high", None, {}])
 def test_refuses_what_is_not_a_cost(cost: Any) -> None:
     with pytest.raises(ValueError, match=r'^info\["cost"\] is .*; a cost must be one number from 0 to 1, or a bool\.$'):
-        read_costs([{"cost": cost}])
+        CostReader()([{"cost": cost}])
 
 
 @pytest.mark.parametrize("cost", [2, 1.001, np.float32(25.0)])
 def test_costs_above_one_are_to_be_divided(cost: Any) -> None:
     with pytest.raises(ValueError, match="divide all costs and cost_limit by the largest possible cost"):
-        read_costs([{"cost": cost}])
+        CostReader()([{"cost": cost}])
 
 
 def test_rounding_is_no_cost_above_one() -> None:
-    assert read_costs([{"cost": 1.0 + 1e-12}]).tolist() == [1.0]
+    assert CostReader()([{"cost": 1.0 + 1e-12}]).tolist() == [1.0]
 
 
 def test_episode_costs() -> None:

@@ -170,6 +170,14 @@ def test_targets_are_averages_whose_buffers_are_up_to_date() -> None:
     assert target.bound.item() == 2.0
 
 
+def test_counters_of_a_network_are_copied() -> None:
+    network = th.nn.BatchNorm1d(3)
+    target = make_target(network)
+    network(th.randn(8, 3))
+    update_target(network, target, 0.1)
+    assert target.num_batches_tracked == 1 and th.equal(target.running_mean, network.running_mean)
+
+
 def test_target_networks_are_frozen_copies() -> None:
     critic = CostCritic(SHAPE, 1, [8])
     target = make_target(critic)

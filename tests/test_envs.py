@@ -168,6 +168,15 @@ def test_traffic_does_not_crash_into_itself_and_merges() -> None:
         ({"reward_weights": {"velocty": 1.0}}, "did you mean 'velocity'"),
         ({"frame": "world"}, "choose one of lane, ego"),
         ({"physics_frequency": 7}, "no multiple"),
+        ({"physics_frequency": 0}, "physics_frequency is 0; choose a whole number from 1 on"),
+        ({"policy_frequency": 0}, "policy_frequency is 0; choose a whole number from 1 on"),
+        ({"policy_frequency": -5}, "policy_frequency is -5; choose"),
+        ({"policy_frequency": 2.5}, r"policy_frequency is 2\.5; choose"),
+        ({"policy_frequency": "5"}, "policy_frequency is '5'; choose"),
+        (
+            {"reward_weights": 0.5},
+            r"reward_weights is 0\.5; give a dictionary with some of the keys velocity, lane, orientation, exploration",
+        ),
     ],
 )
 def test_wrong_configurations_are_named(config: dict[str, Any], message: str) -> None:
@@ -279,7 +288,7 @@ def test_encode_inverts_decode(pedal: float, wheel: float, speed: float) -> None
     np.testing.assert_allclose(controls.encode(*controls.decode(action, speed), speed), action, atol=1e-6)
 
 
-def test_leaving_the_road_is_a_collision_with_the_barrier() -> None:
+def test_leaving_the_road_is_no_collision_but_counts_as_the_barrier() -> None:
     env = alone(y=0.0, heading=-0.1)
     while True:
         _, _, terminated, truncated, info = env.step(HOLD)
@@ -288,8 +297,8 @@ def test_leaving_the_road_is_a_collision_with_the_barrier() -> None:
     assert terminated
     assert info["crashed"]
     assert info["cost"] == 1.0
-    assert info["cost_terms"] == {"collision": True, "off_road": True, "wrong_way": False, "red_light": False}
-    assert info["driving"]["infractions_static"] == 1.0
+    assert info["cost_terms"] == {"collision": False, "off_road": True, "wrong_way": False, "red_light": False}
+    assert info["driving"]["infractions_static"] == info["driving"]["collisions"] == 1.0
     assert not info["is_success"]
 
 
@@ -301,8 +310,17 @@ def test_hitting_something_ends_the_episode_and_is_named(kind: Kind, name: str) 
         _, _, terminated, _, info = env.step(HOLD)
         assert info["cost"] == float(terminated)
     assert env.episode.time == pytest.approx(1.4, abs=0.11), "35 m at 25 m/s"
+    assert info["cost_terms"] == {"collision": True, "off_road": False, "wrong_way": False, "red_light": False}
     assert info["driving"][f"infractions_{name}"] == 1.0
     assert info["driving"]["infractions"] == 1.0
+
+
+def test_hitting_something_off_the_road_is_both_and_costs_once() -> None:
+    env = alone(y=-4.0, others=(User((5.0, -4.0), kind=Kind.STATIC, drives=False),))
+    _, _, terminated, _, info = env.step(HOLD)
+    assert terminated and info["crashed"]
+    assert info["cost_terms"] == {"collision": True, "off_road": True, "wrong_way": False, "red_light": False}
+    assert info["cost"] == info["driving"]["collisions"] == 1.0
 
 
 def test_wrong_way_and_ramp() -> None:
@@ -330,7 +348,11 @@ def test_graded_cost_rises_before_the_crash() -> None:
     assert costs[0] == 0.0
     assert costs[3] == pytest.approx(1 - (45 - 20) / 25 / 1.5)
     assert costs == sorted(costs)
-    assert costs[-1] == pytest.approx(2.0, abs=0.1)
+    assert terminated
+    assert 0.5 < costs[-2] < costs[-1] == 1.0, "a crash costs no more than an indicator"
+    env.reset(seed=0)
+    env.traffic = Traffic(env.road, [User((100.0, 4.0), np.pi, 5.0, drives=False)])
+    assert env.step(HOLD)[-1]["cost"] == 1.0, "the wrong way, with nobody near"
 
 
 def test_reward_terms_by_hand() -> None:

@@ -148,6 +148,19 @@ def test_predictions_are_those_of_the_averages() -> None:
     np.testing.assert_array_equal(model.predict(observation, deterministic=True)[0], expected)
 
 
+def test_only_what_learns_is_in_training_mode() -> None:
+    policy = make_model().policy
+    policy.set_training_mode(True)
+    for name in ("world_model", "actor", "critic", "cost_critic"):
+        assert getattr(policy, name).training and not getattr(policy, f"{name}_target").training
+
+
+def test_the_rate_is_the_third_argument_as_everywhere_in_sb3() -> None:
+    settings = {name: value for name, value in TINY.items() if name != "learning_rate"}
+    model = ESADLEND("MlpPolicy", CountingEnv(), 0.5, **settings)
+    assert model.policy.actor.optimizer.param_groups[0]["lr"] == 0.5 and model.cost_limit == 0.05
+
+
 def test_the_rate_falls_to_zero() -> None:
     model = make_model(learning_rate=FALLING_RATE)
     assert inspect.signature(ESADLEND.__mro__[1]).parameters["learning_rate"].default is FALLING_RATE

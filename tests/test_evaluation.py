@@ -228,6 +228,13 @@ def test_record_model_needs_an_image(tmp_path: Path) -> None:
         record_model(tmp_path / "episode.mp4", make_model("MlpPolicy"), "short-vector-v0", 0)
 
 
+@pytest.mark.parametrize("env_id", ["short-vector-v0", "short-dict-v0"])
+def test_record_model_refuses_another_environment(env_id: str, model: ESADLEND, tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=rf"Observations of {env_id} are .*trained on Box.*; give the id"):
+        record_model(tmp_path / "episode.mp4", model, env_id, 0)
+    assert not list(tmp_path.iterdir())
+
+
 def test_videos_are_mp4(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"episode\.gif is no MP4"):
         record_driver(tmp_path / "episode.gif", "keeper", "short-image-v0", 0)

@@ -6,8 +6,10 @@ from typing import Any
 
 import gymnasium as gym
 import pytest
+from conftest import CountingEnv
 from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad import ESADLEND, hyperparams
 from sb3_esad.hyperparams import RUN_KEYS, check_keys, constructor_arguments, load_hyperparams, read_entries
@@ -106,10 +108,31 @@ def test_the_installed_folder_comes_first(tmp_path: Path, monkeypatch: pytest.Mo
 def test_constructor_arguments() -> None:
     arguments = constructor_arguments(ESADLEND)
     assert {"policy", "cost_limit", "imagination_horizon", "learning_rate", "seed"} <= arguments
-    assert not arguments & {"env", "self", "kwargs", "_init_setup_model"}
+    assert not arguments & {"env", "self", "kwargs", "unknown", "_init_setup_model"}
 
     class Child(SAC):
         def __init__(self, *args: Any, bonus: float = 1.0, **kwargs: Any) -> None:
             super().__init__(*args, **kwargs)
 
     assert constructor_arguments(Child) == constructor_arguments(SAC) | {"bonus"}
+
+
+@pytest.mark.parametrize(
+    "key",
+    [
+        "use_sde",
+        "sde_sample_freq",
+        "use_sde_at_warmup",
+        "n_steps",
+        "sde_support",
+        "support_multi_env",
+        "monitor_wrapper",
+        "supported_action_spaces",
+    ],
+)
+def test_what_the_constructor_refuses_is_refused(key: str) -> None:
+    assert key in inspect.signature(OffPolicyAlgorithm).parameters, "an argument of SB3"
+    with pytest.raises((TypeError, ValueError), match=key):
+        ESADLEND("MlpPolicy", CountingEnv(), **{key: 1})
+    with pytest.raises(ValueError, match=f"'{key}' in mine is no argument of ESADLEND; did you mean"):
+        check_keys(ESADLEND, {key: 1}, "mine")

@@ -12,8 +12,6 @@ from sb3_esad.envs.metrics import (
     LONGEST_TTC,
     DrivingMetrics,
     Episode,
-    format_header,
-    format_row,
     mean_interval,
     summarise,
     wilson_interval,
@@ -185,10 +183,3 @@ def test_wrapper_says_what_is_missing() -> None:
     env.reset()
     with pytest.raises(KeyError, match="wrap a scenario"):
         env.step(0)
-
-
-def test_rows_fit_the_header() -> None:
-    row = format_row("reference", summarise([perfect().record(True)]))
-    head, rule = format_header().splitlines()
-    assert head.count("|") == row.count("|") == rule.count("|")
-    assert "100.0 [100.0, 100.0]" in row

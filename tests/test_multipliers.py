@@ -236,7 +236,7 @@ def test_another_number_of_environments() -> None:
 
 
 def test_warns_once_at_the_upper_bound() -> None:
-    penalty = make_penalty(multiplier_init=50.0)
+    penalty = make_penalty(lagrangian_multiplier_init=50.0)
     calibrate(penalty, 5.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -297,7 +297,7 @@ def test_no_penalty_ignores_everything() -> None:
         ({"penalty_coef": -1.0}, "penalty_coef is -1.0; choose"),
         ({"lambda_lr": -1.0}, "lambda_lr is -1.0; choose"),
         ({"barrier_coef": -1.0}, "barrier_coef is -1.0; choose"),
-        ({"multiplier_init": 99.0}, "multiplier_init is 99.0; choose"),
+        ({"lagrangian_multiplier_init": 99.0}, "lagrangian_multiplier_init is 99.0; choose"),
         ({"multiplier_bounds": (2.0, 1.0)}, "one within 2.0 and 1.0"),
     ],
 )

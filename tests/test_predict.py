@@ -193,6 +193,13 @@ def test_images_as_the_environment_shows_them(channel_first: bool) -> None:
     np.testing.assert_array_equal(one, other)
 
 
+def test_episode_starts_of_another_number_of_environments_are_refused() -> None:
+    model = make_model("MlpPolicy")
+    (observation,) = observe(model, n_envs=3, steps=1)
+    with pytest.raises(ValueError, match=r"3 observation\(s\) with 1 values of episode_start: give one for each"):
+        model.predict(observation, None, np.ones(1, dtype=bool))
+
+
 def test_actions_are_in_the_units_of_the_environment() -> None:
     low, high = np.array([[-3, 0], [10, -1]], np.float32), np.array([[5, 0.1], [20, 1]], np.float32)
     space = spaces.Box(low, high)

@@ -95,9 +95,11 @@ def test_training_goes_on(ent_coef: str | float, tmp_path: Path) -> None:
     model.save(tmp_path / "model")
     loaded = ESADLEND.load(tmp_path / "model", env=make_env("MlpPolicy"), device="cpu")
     penalty = loaded.penalty
+    loaded.learn(16, reset_num_timesteps=False)
+    assert loaded._n_updates == model._n_updates, "a few steps are not enough to learn from"
     loaded.learn(24, reset_num_timesteps=False)
-    assert loaded.num_timesteps == 56 and loaded._n_updates == model._n_updates + 6
-    assert loaded.penalty is penalty and loaded.replay_buffer.size() == 24
+    assert loaded.num_timesteps == 72 and loaded._n_updates == model._n_updates + 6
+    assert loaded.penalty is penalty and loaded.replay_buffer.size() == 40
     assert all(parameter.isfinite().all() for parameter in loaded.policy.parameters())
 
 
@@ -123,6 +125,19 @@ def test_memory_of_the_environment_is_not_saved(tmp_path: Path) -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert ESADLEND.load(tmp_path / "model", device="cpu")._last_latent is None
+
+
+@pytest.mark.parametrize("arguments", [{"cost_limit": None}, {"ent_coef": 0.1}], ids=str)
+def test_arguments_that_do_not_fit_the_saved_networks(arguments: dict[str, Any], tmp_path: Path) -> None:
+    train(ent_coef="auto_0.5").save(tmp_path / "model")
+    with pytest.raises(ValueError, match="model was saved by another version of sb3_esad, or the arguments given to load"):
+        ESADLEND.load(tmp_path / "model", device="cpu", **arguments)
+
+
+def test_file_objects_need_not_be_rewound() -> None:
+    file = io.BytesIO()
+    train().save(file)
+    assert ESADLEND.load(file, device="cpu").num_timesteps == 32
 
 
 def test_arguments_survive(tmp_path: Path) -> None:

@@ -54,7 +54,7 @@ def make_policy(space: spaces.Space, lr: float = 3e-3, **kwargs: Any) -> LatentP
     policy_class = LatentPolicy
     if isinstance(space, spaces.Dict):
         policy_class = LatentMultiInputPolicy
-    elif len(space.shape or ()) == 3:
+    elif isinstance(space, spaces.Box) and len(space.shape) == 3 and space.high.max() <= 255:
         policy_class = LatentCnnPolicy
     settings: dict[str, Any] = {"net_arch": [16], "memory_channels": 8, "latent_channels": 4}
     return policy_class(space, ACTIONS, lambda _: lr, **{**settings, **kwargs})
@@ -425,6 +425,26 @@ def test_float_images_are_pictures_if_they_are_normalised() -> None:
     policy = make_policy(space["view"], normalize_images=False)
     assert policy.world_model.rssm.memory_shape == (8, 4, 4)
     assert isinstance(policy.world_model.observations["observation"], ImageHead)
+
+
+def test_a_single_cell_draws_a_whole_picture() -> None:
+    head = ImageHead((4, 1, 1), (1, 64, 64), foreground_weight=0.0)
+    picture = th.zeros(1, 1, 64, 64)
+    picture[..., 32:] = 1.0  # dark on the left, bright on the right
+    optimizer = th.optim.Adam(head.parameters(), lr=0.01)
+    for _ in range(60):
+        loss = head.loss(th.ones(1, 4, 1, 1), picture)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    assert (head(th.ones(1, 4, 1, 1)) - picture).abs().max() < 0.2
+
+
+def test_numbers_that_are_no_picture_keep_their_digits() -> None:
+    space = spaces.Box(-1e6, 1e6, (2, 3, 3), np.float32)
+    model = make_policy(space).world_model
+    grid = th.full((1, 2, 3, 3), 1234.5678)
+    assert th.equal(cast(th.Tensor, model._preprocess(grid)), grid)
 
 
 def test_background_is_the_median() -> None:

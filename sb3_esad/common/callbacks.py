@@ -67,12 +67,12 @@ class CostEvalCallback(EvalCallback):
     :param eval_env: environment to evaluate in
     :param cost_limit: undiscounted cost allowed per episode; None takes the ``cost_limit`` of the model, if it has one,
         and a model without a limit is always feasible
-    :param cost_key: key of the cost in the info dict
+    :param cost_key: key of the cost in the info dict; None for that of the model, or "cost" if it has none
     :param kwargs: see SB3's ``EvalCallback``
     """
 
     def __init__(
-        self, eval_env: gym.Env | VecEnv, cost_limit: float | None = None, cost_key: str = "cost", **kwargs: Any
+        self, eval_env: gym.Env | VecEnv, cost_limit: float | None = None, cost_key: str | None = None, **kwargs: Any
     ) -> None:
         super().__init__(eval_env, **kwargs)
         self.cost_limit = cost_limit

@@ -39,12 +39,11 @@ def refuse_blank_images(images: dict[str, np.ndarray]) -> None:
     """
     Refuse images without any content.
 
-    :param images: a batch by key
-    :raises ValueError: if all pixels of an image are the same
+    :param images: those of all environments by key
+    :raises ValueError: if under a key each image has the same value in all of its pixels
     """
     remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
     for key, batch in images.items():
-        for image in batch:
-            if np.max(image) == np.min(image):
-                reason = f"Every pixel of the first image '{key}' is {np.max(image)}, nothing can be learned from it"
-                raise ValueError(f"{reason}: {remedy}.")
+        if all(np.max(image) == np.min(image) for image in batch):
+            reason = f"Every pixel of the first image '{key}' is {np.max(batch[0])}, nothing can be learned from it"
+            raise ValueError(f"{reason}: {remedy}.")

@@ -51,18 +51,6 @@ class CostReader:
         warnings.warn(f'No cost: the info dict has no "{self.cost_key}", so the cost counts as 0.{hint}', stacklevel=2)
 
 
-def read_costs(infos: list[dict[str, Any]], cost_key: str = "cost") -> np.ndarray:
-    """
-    Read the costs of one step; use a :class:`CostReader` to be warned only once.
-
-    :param infos: info dicts of one step, one for each environment
-    :param cost_key: key of the cost in the info dict
-    :return: (n_envs,) float32, 0 where the key is missing
-    :raises ValueError: if a cost is not one number in [0, 1]
-    """
-    return CostReader(cost_key)(infos)
-
-
 class FinishedEpisode(NamedTuple):
     """
     What an episode has cost.

@@ -9,6 +9,8 @@ from torch import nn
 from sb3_esad.common.torch_layers import GridReadout, GridShape, conv_block
 from sb3_esad.common.transforms import symexp, symlog
 
+CHANNELS_OF_ONE_CELL = 32
+"""Channels of each part of a picture, where a single cell remembers all of it."""
 FOREGROUND_CONTRAST = 0.1
 MEDIAN_SAMPLE = 32
 MEDIAN_RATE = 0.02
@@ -62,8 +64,9 @@ class ImageHead(ObservationHead):
         self.image_shape = image_shape
         self.foreground_weight = foreground_weight
         self.cells = (math.ceil(image_shape[1] / 8), math.ceil(image_shape[2] / 8))
+        self.spread, grid_channels = _spread(grid_shape, self.cells)
         self.layers = nn.Sequential(
-            conv_block(grid_shape[0], 4 * channels, 1), nn.PixelShuffle(2), conv_block(channels, channels, 3)
+            conv_block(grid_channels, 4 * channels, 1), nn.PixelShuffle(2), conv_block(channels, channels, 3)
         )
         self.pixels = nn.Linear(channels, 16 * image_shape[0])
         self.register_buffer("background", th.zeros(image_shape[0], 1))
@@ -107,9 +110,19 @@ class ImageHead(ObservationHead):
 
     def _patches(self, grid: th.Tensor) -> th.Tensor:
         """Patches of 4x4 pixels, of shape (N, rows, columns, 16 * channels)."""
-        if grid.shape[-2:] != self.cells:
-            grid = nn.functional.interpolate(grid, self.cells)
-        return self.pixels(self.layers(grid).movedim(1, -1))
+        return self.pixels(self.layers(self.spread(grid)).movedim(1, -1))
+
+
+def _spread(grid_shape: GridShape, cells: tuple[int, int]) -> tuple[nn.Module, int]:
+    """Layer from a grid to the cells of a picture, and the channels that it gives."""
+    channels, height, width = grid_shape
+    if (height, width) == cells:
+        return nn.Identity(), channels
+    if height * width > 1:
+        return nn.Upsample(cells), channels
+    # A single cell knows the whole picture, and copies of it would all draw the same
+    wanted = (CHANNELS_OF_ONE_CELL, *cells)
+    return nn.Sequential(nn.Flatten(), nn.Linear(channels, math.prod(wanted)), nn.Unflatten(1, wanted)), wanted[0]
 
 
 class VectorHead(ObservationHead):

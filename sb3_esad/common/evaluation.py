@@ -48,7 +48,7 @@ def evaluate_policy(
     reward_threshold: float | None = None,
     return_episode_rewards: bool = False,
     warn: bool = True,
-    cost_key: str = "cost",
+    cost_key: str | None = None,
 ) -> tuple[float, float, float] | tuple[list[float], list[int], list[float]]:
     """
     SB3's ``evaluate_policy`` with the cost of the episodes as a third result.
@@ -62,11 +62,12 @@ def evaluate_policy(
     :param reward_threshold: mean return below which the evaluation fails
     :param return_episode_rewards: return lists with one entry per episode
     :param warn: warn if the environment has no ``Monitor``
-    :param cost_key: key of the cost in the info dict
+    :param cost_key: key of the cost in the info dict; None for that of the model, or "cost" if it has none
     :return: mean and standard deviation of the return and mean cost of an episode, or the lists of returns, lengths
         and costs of all episodes
     """
-    collector = EpisodeCostCollector(cost_key, callback)
+    key: str = getattr(model, "cost_key", "cost") if cost_key is None else cost_key
+    collector = EpisodeCostCollector(key, callback)
     rewards, lengths = evaluation.evaluate_policy(
         model, env, n_eval_episodes, deterministic, render, collector, return_episode_rewards=True, warn=warn
     )

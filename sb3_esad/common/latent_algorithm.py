@@ -107,6 +107,8 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         :param gradient_steps: number of updates
         :param batch_size: windows in a batch
         """
+        if not self._has_enough_steps():
+            return
         self.policy.set_training_mode(True)
         self._update_learning_rate(list(self._optimizers().values()))
         logs: dict[str, list[float]] = defaultdict(list)

@@ -32,7 +32,7 @@ class AugmentedLagrangian(Penalty):
     :param episode_length: steps of an episode, assumed until cost-free ones have been seen
     :param barrier_coef: weight of the violated barrier condition
     :param lambda_lr: step of the multiplier per update, its integral gain
-    :param multiplier_init: initial multiplier
+    :param lagrangian_multiplier_init: initial multiplier
     :param multiplier_bounds: lowest and highest multiplier
     :param penalty_coef: rho >= 0, the proportional gain; 0 is the plain Lagrangian
     :param penalty_warmup: updates during which the multiplier holds still
@@ -56,7 +56,7 @@ class AugmentedLagrangian(Penalty):
         episode_length: float = 1000.0,
         barrier_coef: float = 1.0,
         lambda_lr: float = 0.01,
-        multiplier_init: float = 1.0,
+        lagrangian_multiplier_init: float = 1.0,
         multiplier_bounds: tuple[float, float] = (0.05, 50.0),
         penalty_coef: float = 1.0,
         penalty_warmup: int = 1000,
@@ -75,7 +75,8 @@ class AugmentedLagrangian(Penalty):
         require(lambda_lr >= 0, "lambda_lr", lambda_lr, "a step >= 0")
         require(penalty_coef >= 0, "penalty_coef", penalty_coef, "a gain >= 0")
         low, high = multiplier_bounds
-        require(0 <= low <= multiplier_init <= high, "multiplier_init", multiplier_init, f"one within {low} and {high}")
+        within, init = f"one within {low} and {high}", lagrangian_multiplier_init
+        require(0 <= low <= init <= high, "lagrangian_multiplier_init", init, within)
         self.cost_limit = cost_limit
         self.risk_level = risk_level
         self.cost_gamma = cost_gamma
@@ -87,7 +88,7 @@ class AugmentedLagrangian(Penalty):
         self.min_episodes = min(min_episodes, window)
         self.calibration_band = calibration_band
         self.episodes = EpisodeRecord(cost_gamma, episode_length, window, road_steps)
-        self.register_buffer("multiplier", th.tensor(float(multiplier_init)))
+        self.register_buffer("multiplier", th.tensor(float(lagrangian_multiplier_init)))
         self.register_buffer("mean_violation", th.zeros(()))
         self.register_buffer("n_updates", th.zeros(()))
         self.register_buffer("updates_at_bound", th.zeros(()))

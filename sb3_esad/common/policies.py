@@ -127,6 +127,16 @@ class LatentPolicy(BasePolicy):
             **{"units": self.critic_arch[0], **self.world_model_kwargs},
         )
 
+    def set_training_mode(self, mode: bool) -> None:
+        """
+        Tell layers such as dropout whether the policy learns; the targets never do.
+
+        :param mode: whether it learns
+        """
+        for network in (self.world_model, self.actor, self.critic, self.cost_critic):
+            network.train(mode)
+        self.training = mode
+
     @property
     def learner(self) -> LatentAgent:
         """The networks that learn, as they act together."""
@@ -161,13 +171,18 @@ class LatentPolicy(BasePolicy):
         :param episode_start: which environments were just reset, of shape (N,); None for none
         :param deterministic: take means instead of samples
         :return: the action, and the memory to hand in next time, arrays of shape (1, N, size)
-        :raises ValueError: if ``state`` belongs to another number of environments
+        :raises ValueError: if ``state`` or ``episode_start`` belong to another number of environments
         """
         self.set_training_mode(False)
         self._refuse_gym_reset(observation)
         tensor, vectorized = self.obs_to_tensor(observation)
         n_envs = len(next(iter(tensor.values())) if isinstance(tensor, dict) else tensor)
         start = np.zeros(n_envs, dtype=bool) if episode_start is None else np.asarray(episode_start, dtype=bool).reshape(-1)
+        if len(start) != n_envs:
+            remedy = "give one for each environment, or None for none"
+            raise ValueError(
+                f"predict() was given {n_envs} observation(s) with {len(start)} values of episode_start: {remedy}."
+            )
         starts = th.as_tensor(start, device=self.device)
         latent = self.average.filter(tensor, self._from_numpy(state, n_envs), starts, deterministic)
         actions = self.average.act(latent, deterministic)

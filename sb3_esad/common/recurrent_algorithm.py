@@ -42,7 +42,8 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param env: environment with a Box action space
     :param learning_rate: of all networks, a number or a function of the remaining progress
     :param buffer_size: number of steps to remember
-    :param learning_starts: steps of random actions of random amplitude, each held for ``random_hold`` steps, before learning
+    :param learning_starts: steps of random actions of random amplitude, each held for ``random_hold`` steps, before learning;
+        a loaded model without its replay buffer first collects as many with its own actions
     :param batch_size: windows in a batch
     :param sequence_length: steps in a window
     :param tau: share of the learned networks in their targets at each update
@@ -125,6 +126,8 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
             sde_support=False,
         )
         self._check_action_space()
+        for name in {"sequence_length", "cost_key"} & self.replay_buffer_kwargs.keys():
+            require(False, f"replay_buffer_kwargs[{name!r}]", self.replay_buffer_kwargs[name], f"it as the argument {name}")
         self.sequence_length = sequence_length
         self.random_hold = random_hold
         self.cost_key = cost_key
@@ -135,9 +138,9 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
     def _check_action_space(self) -> None:
         if self.env is None:
             return  # as in load: the spaces are those of the saved model
-        remedy = "with highway-env, configure its action as {'type': 'ContinuousAction'}, or wrap the environment"
-        message = f"{type(self).__name__} needs a Box of actions, not {self.action_space}: {remedy}."
-        assert isinstance(self.action_space, spaces.Box), message
+        if not isinstance(self.action_space, spaces.Box):
+            remedy = "with highway-env, configure its action as {'type': 'ContinuousAction'}, or wrap the environment"
+            raise ValueError(f"{type(self).__name__} needs a Box of actions, not {self.action_space}: {remedy}.")
 
     def _check_arguments(self) -> None:
         require(self.batch_size >= 1, "batch_size", self.batch_size, "a number of windows >= 1")
@@ -207,6 +210,11 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._last_episode_starts = dones
 
+    def _has_enough_steps(self) -> bool:
+        """Whether there is enough to learn from: a loaded model that came without its buffer would unlearn on a few steps."""
+        buffer = self.replay_buffer
+        return buffer.full or buffer.size() * self.n_envs >= self.learning_starts
+
     # Logging: what an episode costs stands beside what it earns
 
     def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
@@ -265,10 +273,14 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
         :param args: see SB3's ``BaseAlgorithm.load``
         :param kwargs: likewise
         :return: the model
-        :raises ValueError: if the file is missing, damaged or holds something else
+        :raises ValueError: if the file is missing, damaged, of another version or holds something else
         """
         check_saved_model(path, cls.__name__, mark="random_hold")
-        return super().load(path, *args, **kwargs)
+        try:
+            return super().load(path, *args, **kwargs)
+        except (KeyError, RuntimeError) as error:
+            reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
+            raise ValueError(f"The model in {path} {reason} ({str(error).splitlines()[0]}).") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]

@@ -57,6 +57,7 @@ def check_saved_model(path: Target, algorithm: str, mark: str) -> None:
     :raises ValueError: if it is missing, no zip, damaged, no model of SB3, or one of another algorithm
     """
     if not isinstance(path, str | pathlib.Path):
+        path.seek(0)
         _check_archive(path, getattr(path, "name", "the given file object"), algorithm, mark)
         path.seek(0)
         return

@@ -28,4 +28,5 @@ def update_target(network: nn.Module, target: nn.Module, tau: float) -> None:
     :param tau: share of the network in its average, in (0, 1]
     """
     polyak_update(network.parameters(), target.parameters(), tau)
-    polyak_update(network.buffers(), target.buffers(), 1.0)
+    for buffer, copy in zip(network.buffers(), target.buffers(), strict=True):
+        copy.copy_(buffer)

@@ -205,7 +205,10 @@ class WorldModel(LearningModule):
     def _preprocess(self, observations: Observations) -> Observations:
         # Images are as exact in bfloat16 as they were as bytes, and half as large
         preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
-        return _map(preprocessed, lambda x: x.to(working_dtype(x.device)) if x.dim() == 4 else x)
+        if isinstance(preprocessed, dict):
+            images = self.images(preprocessed)
+            return {key: x.to(working_dtype(x.device)) if key in images else x for key, x in preprocessed.items()}
+        return preprocessed.to(working_dtype(preprocessed.device)) if self.images(preprocessed) else preprocessed
 
 
 def _by_key(observations: Observations) -> TensorDict:

@@ -204,36 +204,3 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
     figures["TTC_5"] = float(np.percentile(columns["min_ttc"], 5))
     figures["cost_cvar"] = worst_mean(columns["cost"])
     return figures
-
-
-TABLE_COLUMNS = {
-    "DS": ".1f", "RC": ".1f", "IS": ".1f", "CO": ".3f", "CR": ".2f", "IPK": ".2f", "TTC": ".2f", "TTC_5": ".2f",
-    "success": ".2f", "collision_free": ".2f", "speed": ".1f", "return": ".1f", "cost": ".2f", "cost_cvar": ".2f",
-}  # fmt: skip
-
-
-def format_header() -> str:
-    """
-    Head of the Markdown table that :func:`format_row` fills.
-
-    :return: two lines
-    """
-    names = ["", *TABLE_COLUMNS]
-    return f"| {' | '.join(names)} |\n|{'---|' * len(names)}"
-
-
-def format_row(name: str, figures: Mapping[str, float]) -> str:
-    """
-    One row of a Markdown table.
-
-    :param name: first cell
-    :param figures: from :func:`summarise`
-    :return: one line, the interval of DS and of the collision-free share in brackets
-    """
-    cells = []
-    for key, form in TABLE_COLUMNS.items():
-        cell = f"{figures[key]:{form}}"
-        if key in ("DS", "collision_free"):
-            cell += f" [{figures[f'{key}_low']:{form}}, {figures[f'{key}_high']:{form}}]"
-        cells.append(cell)
-    return f"| {' | '.join([name, *cells])} |"

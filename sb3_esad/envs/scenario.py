@@ -2,6 +2,7 @@
 
 import math
 from collections import Counter
+from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -27,8 +28,9 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     A drive along a route among other road users; subclasses place road and traffic.
 
     The action is acceleration and steering in [-1, 1]. ``info`` holds at every step ``cost`` (1 on a collision, off the
-    road, in the wrong direction or past a red light, else 0), ``cost_terms``, ``rewards`` (the terms by name), ``speed``
-    and ``crashed``; at an episode's end also ``is_success`` and ``driving``, the record of :class:`Episode`.
+    road, in the wrong direction or past a red light, else 0, or with ``graded_cost`` up to 1 as something comes near),
+    ``cost_terms``, ``rewards`` (the terms by name), ``speed`` and ``crashed``; at an episode's end also ``is_success`` and
+    ``driving``, the record of :class:`Episode`.
 
     :param config: overrides of :meth:`default_config`
     :param observation: ``"image"``, ``"vector"`` or ``"dict"``
@@ -49,6 +51,9 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             raise ValueError(f"unknown render_mode {render_mode!r}; choose one of {self.metadata['render_modes']} or None")
         self.config = merge_config(self.default_config(), config or {})
         physics, policy = self.config["physics_frequency"], self.config["policy_frequency"]
+        for name, frequency in (("physics_frequency", physics), ("policy_frequency", policy)):
+            if not isinstance(frequency, Integral) or frequency < 1:
+                raise ValueError(f"{name} is {frequency!r}; choose a whole number from 1 on")
         if physics % policy:
             raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
         self.render_mode = render_mode
@@ -118,6 +123,11 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return self.crashed or self._is_success()
 
     @property
+    def crashed(self) -> bool:
+        """Whether the ego vehicle hit something or left the road."""
+        return self.collided or self.off_road
+
+    @property
     def max_episode_steps(self) -> int:
         """Decisions after which an episode is truncated."""
         return round(self.config["duration"] * self.config["policy_frequency"])
@@ -151,7 +161,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.road = self._make_road()
         self.traffic = self._make_traffic()
         self.episode = Episode(self.route_length)
-        self.crashed = False
+        self.collided = False
         self.off_road = False
         return self.observation.observe(self), self._state()
 
@@ -171,7 +181,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         reward = sum(self.config["reward_weights"][name] * value for name, value in terms.items())
         cost_terms = self._cost_terms()
         ttc = time_to_collision(self.traffic)
-        cost = float(any(cost_terms.values())) + self._graded_cost(ttc)
+        cost = max(float(any(cost_terms.values())), self._graded_cost(ttc))
         self.episode.add_outcome(reward, cost, ttc)
         terminated = self._is_terminated()
         truncated = not terminated and self._is_truncated()
@@ -208,12 +218,12 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
 
     def _check_crash(self) -> None:
         hit = users_hit(self.traffic)
+        self.collided = bool(hit.size)
         self.off_road = is_off_road(self.road, self.traffic)
-        if hit.size:
+        if self.collided:
             self.episode.add_infraction(Kind(self.traffic.kind[hit[0]]).name.lower())
         elif self.off_road:
             self.episode.add_infraction("static")
-        self.crashed = bool(hit.size) or self.off_road
 
     def _wrong_way(self) -> bool:
         return abs(self.heading_error) > math.pi / 2
@@ -223,7 +233,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         if red_light:
             self.episode.add_infraction("red_light")
         return {
-            "collision": self.crashed,
+            "collision": self.collided,
             "off_road": self.off_road,
             "wrong_way": self._wrong_way(),
             "red_light": red_light,

@@ -8,13 +8,13 @@ import torch as th
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
 
 from sb3_esad.common.callbacks import LagrangeCallback, prepend
 from sb3_esad.common.checks import require
 from sb3_esad.common.entropy import make_entropy_coefficient
 from sb3_esad.common.functional import barrier_residual, capped_cvar, tail_factor
-from sb3_esad.common.latent_algorithm import LatentAlgorithm
+from sb3_esad.common.latent_algorithm import FALLING_RATE, LatentAlgorithm
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.penalties import NoPenalty, Penalty
 from sb3_esad.common.policies import LatentPolicy
@@ -45,6 +45,7 @@ class ESADLEND(LatentAlgorithm):
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
     :param env: environment with a Box action space, whose info dict holds a cost in [0, 1]
+    :param learning_rate: of all networks, a number or a function of the remaining progress; falls from 0.006 to 0 by default
     :param cost_limit: undiscounted cost allowed per episode; 0 is strict, None is no limit
     :param risk_level: worst fraction of outcomes that shall keep the limit, in (0, 1]; 1 limits the mean
     :param cost_gamma: discount of the cost; None for ``gamma``
@@ -76,6 +77,7 @@ class ESADLEND(LatentAlgorithm):
         self,
         policy: str | type[LatentPolicy],
         env: GymEnv | str,
+        learning_rate: float | Schedule = FALLING_RATE,
         cost_limit: float | None = 0.05,
         risk_level: float = 0.5,
         cost_gamma: float | None = None,
@@ -95,7 +97,7 @@ class ESADLEND(LatentAlgorithm):
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
-        super().__init__(policy, env, _init_setup_model=False, **kwargs)
+        super().__init__(policy, env, learning_rate, _init_setup_model=False, **kwargs)
         self.cost_limit = cost_limit
         self.risk_level = risk_level
         self.cost_gamma = cost_gamma
@@ -140,7 +142,7 @@ class ESADLEND(LatentAlgorithm):
             episode_length=self._episode_length(),
             barrier_coef=self.barrier_coef,
             lambda_lr=self.lambda_lr,
-            multiplier_init=self.lagrangian_multiplier_init,
+            lagrangian_multiplier_init=self.lagrangian_multiplier_init,
             multiplier_bounds=(min(0.05, self.lagrangian_multiplier_init), self.lagrangian_upper_bound),
             penalty_coef=self.penalty_coef,
             penalty_warmup=self.penalty_warmup,
