@@ -161,7 +161,8 @@ def test_the_rate_is_the_third_argument_as_everywhere_in_sb3() -> None:
     assert model.policy.actor.optimizer.param_groups[0]["lr"] == 0.5 and model.cost_limit == 0.05
 
 
-def test_the_rate_falls_to_zero() -> None:
+def test_the_rate_is_held_and_falls_to_zero() -> None:
+    assert [FALLING_RATE(progress) for progress in (1.0, 0.5, 0.25, 0.0)] == pytest.approx([0.006, 0.006, 0.003, 0.0])
     model = make_model(learning_rate=FALLING_RATE)
     assert inspect.signature(ESADLEND.__mro__[1]).parameters["learning_rate"].default is FALLING_RATE
     assert {group["lr"] for each in model._optimizers().values() for group in each.param_groups} == {0.006}

@@ -10,6 +10,7 @@ from stable_baselines3.common.monitor import Monitor
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.evaluation import evaluate_policy
+from sb3_esad.common.schedules import HoldThenFall
 
 
 class TwoRoads(gym.Env):
@@ -51,7 +52,7 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         "MlpPolicy",
         Monitor(TwoRoads(chance)),
         cost_limit=cost_limit,
-        learning_rate=5e-3,
+        learning_rate=HoldThenFall(5e-3, hold=0.5),
         learning_starts=200,
         pretrain_steps=30,
         train_freq=8,

@@ -8,20 +8,20 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
-from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
 from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.schedules import HoldThenFall
 from sb3_esad.common.starts import choose_starts
 from sb3_esad.common.target_networks import update_target
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
 
 SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
 
-FALLING_RATE = LinearSchedule(start=0.006, end=0.0, end_fraction=1.0)
+FALLING_RATE = HoldThenFall(start=0.006, hold=0.5)
 """A constant rate, large enough to learn, swings between driving too fast and crawling (docs/experiments.md, section 5)."""
 
 
@@ -31,7 +31,8 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
     :param env: environment with a Box action space
-    :param learning_rate: of all networks, a number or a function of the remaining progress; falls from 0.006 to 0 by default
+    :param learning_rate: of all networks, a number or a function of the remaining progress; 0.006 by default, which
+        falls to 0 in the second half of the training
     :param pretrain_steps: updates of the world model alone, before the first update of the behaviour
     :param imagination_horizon: H, imagined steps
     :param imagination_starts: number of imagined trajectories in an update

@@ -45,7 +45,8 @@ class ESADLEND(LatentAlgorithm):
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
     :param env: environment with a Box action space, whose info dict holds a cost in [0, 1]
-    :param learning_rate: of all networks, a number or a function of the remaining progress; falls from 0.006 to 0 by default
+    :param learning_rate: of all networks, a number or a function of the remaining progress; 0.006 by default, which
+        falls to 0 in the second half of the training
     :param cost_limit: undiscounted cost allowed per episode; 0 is strict, None is no limit
     :param risk_level: worst fraction of outcomes that shall keep the limit, in (0, 1]; 1 limits the mean
     :param cost_gamma: discount of the cost; None for ``gamma``
