@@ -20,7 +20,7 @@ from sb3_esad.report import Figures, format_table, summarise_any
 from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
-TIMESTEPS, MINUTES = 13_000, 7.0
+TIMESTEPS, MINUTES = 11_500, 7.0
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
