@@ -14,6 +14,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
 from sb3_esad import ESADLEND
+from sb3_esad.common.schedules import HoldThenFall
 from tests.conftest import PICTURE, SPACES, TINY, VECTOR, CountingEnv, RandomEnv
 
 
@@ -242,3 +243,9 @@ def test_arguments_of_the_buffer_that_are_the_algorithms(name: str, value: Any) 
     with pytest.raises(ValueError) as error:
         make_model(replay_buffer_kwargs={name: value})
     check_sentence(error, f"replay_buffer_kwargs['{name}'] is {value!r}", f"the argument {name}")
+
+
+def test_a_rate_that_never_falls_is_a_number() -> None:
+    with pytest.raises(ValueError) as error:
+        HoldThenFall(0.006, hold=1.0)
+    check_sentence(error, "hold is 1.0", "[0, 1)")

@@ -280,7 +280,7 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
             return super().load(path, *args, **kwargs)
         except (KeyError, RuntimeError) as error:
             reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
-            raise ValueError(f"The model in {path} {reason} ({str(error).splitlines()[0]}).") from error
+            raise ValueError(f"The model in {path} {reason} ({str(error).partition(chr(10))[0]}).") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]

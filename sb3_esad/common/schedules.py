@@ -1,5 +1,7 @@
 """How a learning rate goes on."""
 
+from sb3_esad.common.checks import require
+
 
 class HoldThenFall:
     """
@@ -7,9 +9,11 @@ class HoldThenFall:
 
     :param start: value that is held
     :param hold: share of the training during which it is, in [0, 1)
+    :raises ValueError: if ``hold`` is outside [0, 1)
     """
 
     def __init__(self, start: float, hold: float) -> None:
+        require(0 <= hold < 1, "hold", hold, "a share of the training in [0, 1)")
         self.start = start
         self.hold = hold
 
