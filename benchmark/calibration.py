@@ -122,8 +122,8 @@ def main() -> None:
     bins = [Visits(*(column[chosen] for column in visits)) for chosen in np.array_split(order, BINS)]
     for name, each in [("all", visits), *((str(index), each) for index, each in enumerate(bins))]:
         mean, found_mean, deviation, found_deviation = figures(each)
-        means = f"mean {mean:.4f} against {found_mean:.4f} ({mean / found_mean:.2f})"
-        deviations = f"deviation {deviation:.3f} against {found_deviation:.3f} ({deviation / found_deviation:.2f})"
+        means = f"mean {mean:.4f} against {found_mean:.4f}"
+        deviations = f"deviation {deviation:.3f} against {found_deviation:.3f}"
         print(f"{name:>4}: {len(each.mean)} states, {means}, {deviations}")
     plot(args.out, bins)
 
