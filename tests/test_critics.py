@@ -1,13 +1,11 @@
 """Critics: they learn the mean and the spread of what is known, and their targets are constants."""
 
-from types import SimpleNamespace
 from typing import Any, cast
 
 import pytest
 import torch as th
 
 from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, QEnsemble
-from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.target_networks import make_target, update_target
 from sb3_esad.common.type_aliases import Imagination, Predictions
 from sb3_esad.esad_lend.targets import (
@@ -46,16 +44,14 @@ def hazard_record(hazard: float, n: int) -> Transitions:
     return Transitions(grids, actions, grids, actions, Predictions(th.zeros(n), crashes, 1 - crashes), th.ones(n))
 
 
-def cost_policy(bound: float = 1.0) -> LatentPolicy:
-    """All of a policy that the targets of the cost look at."""
+def make_cost_critic(bound: float = 1.0) -> CostCritic:
     critic = CostCritic(SHAPE, 1, [8])
     critic.raise_bound(bound)
-    return cast(LatentPolicy, SimpleNamespace(cost_critic=critic, cost_critic_target=make_target(critic)))
+    return critic
 
 
-def fit(policy: LatentPolicy, make_targets: Any, n: int, steps: int = 300) -> tuple[float, float]:
-    """Fitted Q iteration, the target following at once; an average over the last steps."""
-    critic = policy.cost_critic
+def fit(critic: CostCritic, make_targets: Any, n: int, steps: int = 300) -> tuple[float, float]:
+    """Fitted Q iteration; an average over the last steps."""
     optimizer = th.optim.Adam(critic.parameters(), lr=0.02)
     schedule = th.optim.lr_scheduler.LinearLR(optimizer, 1.0, 0.02, steps)
     estimates = []
@@ -66,7 +62,6 @@ def fit(policy: LatentPolicy, make_targets: Any, n: int, steps: int = 300) -> tu
         (mean_loss + variance_loss).mean().backward()
         optimizer.step()
         schedule.step()
-        policy.cost_critic_target.load_state_dict(critic.state_dict())
         if step >= steps // 2:
             means, variance = critic(*state_and_action())
             estimates.append([means.mean().item(), variance.sqrt().item()])
@@ -77,40 +72,40 @@ def fit(policy: LatentPolicy, make_targets: Any, n: int, steps: int = 300) -> tu
 @pytest.mark.parametrize(("hazard", "mean", "deviation"), HAZARDS)
 @pytest.mark.parametrize("bound", [1.0, 20.0])
 def test_hazard_chain_learned_from_dreams(hazard: float, mean: float, deviation: float, bound: float) -> None:
-    policy, dream = cost_policy(bound), hazard_dream(hazard, steps=5)
-    learned = fit(policy, lambda: cost_targets(policy, dream, GAMMA, 0.95, continue_after_cost=0.0), n=5)
+    critic, dream = make_cost_critic(bound), hazard_dream(hazard, steps=5)
+    learned = fit(critic, lambda: cost_targets(critic, dream, GAMMA, 0.95, continue_after_cost=0.0), n=5)
     assert learned == pytest.approx((mean, deviation), rel=0.05)
 
 
 @pytest.mark.parametrize(("hazard", "mean", "deviation"), HAZARDS)
 def test_hazard_chain_learned_from_the_road(hazard: float, mean: float, deviation: float) -> None:
-    policy = cost_policy()
+    critic = make_cost_critic()
 
     def draw() -> CostTargets:
-        return recorded_cost_targets(policy, hazard_record(hazard, 2048), GAMMA)
+        return recorded_cost_targets(critic, hazard_record(hazard, 2048), GAMMA)
 
-    learned = fit(policy, draw, n=2048)
+    learned = fit(critic, draw, n=2048)
     assert learned == pytest.approx((mean, deviation), rel=0.05)
 
 
 def test_costs_that_do_not_end_the_episode() -> None:
     """A cost of probability p at every step, forever: mean p / (1 - gamma), variance p (1 - p) / (1 - gamma^2)."""
-    policy, steps, p = cost_policy(bound=1 / (1 - GAMMA)), 5, 0.1
+    critic, steps, p = make_cost_critic(bound=1 / (1 - GAMMA)), 5, 0.1
     dream = hazard_dream(p, steps)
     predictions = dream.predictions._replace(continues=th.ones(steps, 1))
     dream = dream._replace(predictions=predictions)
-    learned = fit(policy, lambda: cost_targets(policy, dream, GAMMA, 0.95, continue_after_cost=1.0), n=steps)
+    learned = fit(critic, lambda: cost_targets(critic, dream, GAMMA, 0.95, continue_after_cost=1.0), n=steps)
     assert learned == pytest.approx((p / (1 - GAMMA), (p * (1 - p) / (1 - GAMMA**2)) ** 0.5), rel=0.05)
 
 
 def test_targets_of_the_mean_are_the_mean_of_the_critics() -> None:
     """Pessimism within the bootstrap would compound."""
-    policy = cost_policy()
+    critic = make_cost_critic()
     dream, record = hazard_dream(0.0, steps=1), hazard_record(0.0, 3)
-    means, variance = policy.cost_critic_target(*state_and_action())
+    means, variance = critic(*state_and_action())
     assert abs(means[0] - means[1]) > 1e-4
-    imagined = cost_targets(policy, dream, GAMMA, 0.95, 0.0)
-    recorded = recorded_cost_targets(policy, record, GAMMA)
+    imagined = cost_targets(critic, dream, GAMMA, 0.95, 0.0)
+    recorded = recorded_cost_targets(critic, record, GAMMA)
     expected_variance = (GAMMA * means.mean() - means.mean()) ** 2 + GAMMA**2 * variance
     for targets in (imagined, recorded):
         th.testing.assert_close(targets.means.flatten(), GAMMA * means.mean().expand(targets.means.numel()))
@@ -118,40 +113,39 @@ def test_targets_of_the_mean_are_the_mean_of_the_critics() -> None:
 
 
 def test_decisions_fear_the_larger_estimate() -> None:
-    policy = cost_policy()
-    means, _ = policy.cost_critic(*state_and_action())
-    imagined = imagined_costs(policy.cost_critic, hazard_dream(0.1, steps=1), GAMMA, 0.95)
+    critic = make_cost_critic()
+    means, _ = critic(*state_and_action())
+    imagined = imagined_costs(critic, hazard_dream(0.1, steps=1), GAMMA, 0.95)
     th.testing.assert_close(imagined, (0.1 + GAMMA * 0.9 * means.max()).view(1, 1))
 
 
-def reward_policy() -> LatentPolicy:
+def make_critic() -> QEnsemble:
     critic = QEnsemble(SHAPE, 1, [8])
     for network in critic.q_networks:
         th.nn.init.normal_(cast(Any, network)[-1].weight, std=0.3)
-    return cast(LatentPolicy, SimpleNamespace(critic=critic, critic_target=make_target(critic)))
+    return critic
 
 
 def test_return_targets_take_the_smaller_critic_and_stop_at_the_end() -> None:
-    policy = reward_policy()
-    values = policy.critic_target(*state_and_action())
+    critic = make_critic()
+    values = critic(*state_and_action())
     assert values[0] != values[1]
     smaller = values.min()
-    imagined = imagined_returns(policy.critic_target, hazard_dream(0.2, 1, reward=3.0), GAMMA, 0.95)
+    imagined = imagined_returns(critic, hazard_dream(0.2, 1, reward=3.0), GAMMA, 0.95)
     th.testing.assert_close(imagined, (3.0 + GAMMA * 0.8 * smaller).view(1, 1))
     grids, actions = state_and_action(2)
     outcomes = Predictions(th.tensor([1.0, 2.0]), th.zeros(2), th.tensor([1.0, 0.0]))
     record = Transitions(grids, actions, grids, actions, outcomes, th.ones(2))
     expected = th.stack([1.0 + GAMMA * smaller, th.tensor(2.0)])
-    th.testing.assert_close(recorded_return_targets(policy, record, GAMMA), expected)
+    th.testing.assert_close(recorded_return_targets(critic, record, GAMMA), expected)
 
 
 def test_targets_have_no_gradient() -> None:
-    costs, rewards, record = cost_policy(), reward_policy(), hazard_record(0.1, 3)
+    costs, rewards, record = make_cost_critic(), make_critic(), hazard_record(0.1, 3)
     dream = hazard_dream(0.1, 3)
     targets = [
         *cost_targets(costs, dream, GAMMA, 0.95, 0.0),
         *recorded_cost_targets(costs, record, GAMMA),
-        imagined_returns(rewards.critic_target, dream, GAMMA, 0.95),
         recorded_return_targets(rewards, record, GAMMA),
     ]
     assert not any(target.requires_grad for target in targets)

@@ -211,10 +211,10 @@ class ESADLEND(LatentAlgorithm):
         }
 
     def _update_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        with th.no_grad():
-            targets = imagined_returns(self.policy.critic_target, imagined, self.gamma, self.lambda_return)
-        recorded_targets = recorded_return_targets(self.policy, recorded, self.gamma)
         critic = self.policy.critic
+        with th.no_grad():
+            targets = imagined_returns(critic, imagined, self.gamma, self.lambda_return)
+        recorded_targets = recorded_return_targets(critic, recorded, self.gamma)
         critic.follow_scale(targets)
         dreamed = (imagined.weights.flatten() * critic.loss(*taken(imagined), targets.flatten())).mean()
         anchored = (recorded.event_weights * critic.loss(recorded.grids, recorded.actions, recorded_targets)).mean()
@@ -232,8 +232,8 @@ class ESADLEND(LatentAlgorithm):
         if continue_after_cost > 0:
             for each in (critic, self.policy.cost_critic_target):
                 each.raise_bound(1 / (1 - self._cost_gamma))
-        targets = cost_targets(self.policy, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(self.policy, recorded, self._cost_gamma)
+        targets = cost_targets(critic, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
+        anchors = recorded_cost_targets(critic, recorded, self._cost_gamma)
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)

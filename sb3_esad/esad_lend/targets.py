@@ -1,4 +1,9 @@
-"""What the critics of ESAD-LEND learn: targets from imagined trajectories and from recorded transitions."""
+"""
+What the critics of ESAD-LEND learn: targets from imagined trajectories and from recorded transitions.
+
+Critics bootstrap from themselves as they are, not from their slow averages: at a few hundred updates the lag of an average,
+compounded by the bootstrap, kept the estimates at what early policies deserved (docs/experiments.md, section 7).
+"""
 
 from typing import NamedTuple
 
@@ -117,12 +122,12 @@ def imagined_costs(critic: CostCritic, imagined: Imagination, gamma: float, lamb
 
 @th.no_grad()
 def cost_targets(
-    policy: LatentPolicy, imagined: Imagination, gamma: float, lambda_: float, continue_after_cost: float
+    critic: CostCritic, imagined: Imagination, gamma: float, lambda_: float, continue_after_cost: float
 ) -> CostTargets:
     """
-    Lambda-returns of the cost and of its variance (Sherstan et al. 2018), bootstrapped by the mean of the target critics.
+    Lambda-returns of the cost and of its variance (Sherstan et al. 2018), bootstrapped by the mean of the estimates.
 
-    :param policy: owns the critics
+    :param critic: ensemble to bootstrap from
     :param imagined: trajectories of H steps
     :param gamma: discount of the cost
     :param lambda_: mixing of n-step returns
@@ -130,9 +135,9 @@ def cost_targets(
     :return: fields of shape (H, N)
     """
     _, costs, continues = imagined.predictions
-    next_means, next_variances = policy.cost_critic_target(*reached(imagined))
+    next_means, next_variances = critic(*reached(imagined))
     next_mean, next_variance = next_means.mean(0).view_as(costs), next_variances.view_as(costs)
-    means, _ = policy.cost_critic(*taken(imagined))
+    means, _ = critic(*taken(imagined))
     joint = indicator_joint(costs, continues, continue_after_cost)
     error = expected_squared_error(costs, costs, joint, continues, means.mean(0).view_as(costs), next_mean, gamma)
     return CostTargets(
@@ -142,33 +147,33 @@ def cost_targets(
 
 
 @th.no_grad()
-def recorded_return_targets(policy: LatentPolicy, recorded: Transitions, gamma: float) -> th.Tensor:
+def recorded_return_targets(critic: QEnsemble, recorded: Transitions, gamma: float) -> th.Tensor:
     """
     One-step targets of the reward critics from what really happened.
 
-    :param policy: owns the critics
+    :param critic: ensemble to bootstrap from
     :param recorded: N transitions
     :param gamma: discount
     :return: shape (N,)
     """
     rewards, _, continues = recorded.outcomes
-    return rewards + gamma * continues * policy.critic_target(recorded.next_grids, recorded.next_actions).min(0).values
+    return rewards + gamma * continues * critic(recorded.next_grids, recorded.next_actions).min(0).values
 
 
 @th.no_grad()
-def recorded_cost_targets(policy: LatentPolicy, recorded: Transitions, gamma: float) -> CostTargets:
+def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: float) -> CostTargets:
     """
     One-step targets of the cost critics from what really happened: they keep the critics honest when the model is not.
 
-    :param policy: owns the critics
+    :param critic: ensemble to bootstrap from
     :param recorded: N transitions
     :param gamma: discount of the cost
     :return: fields of shape (N,)
     """
     _, costs, continues = recorded.outcomes
-    next_means, next_variance = policy.cost_critic_target(recorded.next_grids, recorded.next_actions)
+    next_means, next_variance = critic(recorded.next_grids, recorded.next_actions)
     next_mean = next_means.mean(0)
-    mean = policy.cost_critic(recorded.grids, recorded.actions)[0].mean(0)
+    mean = critic(recorded.grids, recorded.actions)[0].mean(0)
     return CostTargets(
         costs + gamma * continues * next_mean,
         sampled_variance_target(costs, continues, mean, next_mean, next_variance, gamma),
