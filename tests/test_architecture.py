@@ -15,6 +15,7 @@ LAYERS = [
     "common.type_aliases common.functional common.transforms common.torch_layers common.target_networks common.optimizers",
     "common.precision common.checks common.memory common.schedules",
     "common.costs common.frames common.windows common.buffers",
+    "common.recent_sums",
     "common.episode_record common.penalties common.multipliers common.entropy",
     "common.latents common.extractors common.decoders common.heads common.actor",
     "common.rssm common.diffusion",

@@ -55,23 +55,23 @@ def test_rounding_is_no_cost_above_one() -> None:
 
 
 def test_episode_costs() -> None:
-    episodes = EpisodeCosts(discount=0.5)
+    episodes = EpisodeCosts()
     assert episodes.add(np.array([1.0, 0.0]), np.array([False, False])) == []
     (first,) = episodes.add(np.array([1.0, 4.0]), np.array([True, False]))
-    assert first == (0, 2.0, 1.5, 2)
+    assert first == (0, 2.0, 2)
     both = episodes.add(np.array([0.0, 4.0]), np.array([True, True]))
-    assert both == [(0, 0.0, 0.0, 1), (1, 8.0, 3.0, 3)]
+    assert both == [(0, 0.0, 1), (1, 8.0, 3)]
 
 
 def test_unfinished_episodes_can_be_forgotten() -> None:
     episodes = EpisodeCosts()
     episodes.add(np.ones(1), np.zeros(1, dtype=bool))
     episodes.clear()
-    assert episodes.add(np.ones(1), np.ones(1, dtype=bool)) == [(0, 1.0, 1.0, 1)]
+    assert episodes.add(np.ones(1), np.ones(1, dtype=bool)) == [(0, 1.0, 1)]
 
 
 def test_episode_costs_start_afresh_with_another_number_of_environments() -> None:
     episodes = EpisodeCosts()
     episodes.add(np.ones(2), np.zeros(2, dtype=bool))
     (only,) = episodes.add(np.ones(1), np.ones(1, dtype=bool))
-    assert only == (0, 1.0, 1.0, 1)
+    assert only == (0, 1.0, 1)

@@ -424,13 +424,13 @@ def test_memory_starts_afresh_with_each_episode(monkeypatch: pytest.MonkeyPatch)
     assert starts[4:6] == [[True, True], [False, False]]
 
 
-def test_critics_are_asked_about_whole_episodes_where_they_start(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_critics_are_asked_about_every_state_of_the_policy(monkeypatch: pytest.MonkeyPatch) -> None:
     model = make_model(DummyVecEnv([lambda: CountingEnv(episode_length=5)] * 2))
     model.learn(40)
     noted: list[int] = []
     monkeypatch.setattr(model.penalty, "note_prediction", lambda values: noted.append(len(values)))
     model.learn(24, reset_num_timesteps=False)
-    assert noted == [2, 0, 0, 0, 0, 2, 0, 0, 0, 0, 2, 0]
+    assert noted == [2] * 12
 
 
 def test_costs_of_episodes_are_logged() -> None:
@@ -545,7 +545,7 @@ def test_without_costs_the_multiplier_falls_and_with_them_it_rises() -> None:
     for env in (FreeEnv(), CountingEnv()):
         model = make_model(env, cost_limit=0.5, penalty_warmup=0, lambda_lr=0.1, learning_starts=8)
         assert isinstance(model.penalty, AugmentedLagrangian)
-        model.penalty.episodes.road_steps = 20
+        model.penalty.episodes.recent.steps = 20
         model.learn(100)
         multipliers.append(model.penalty.multiplier.item())
     assert multipliers[0] < 0.9 < 1.1 < multipliers[1]

@@ -132,24 +132,19 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        starts = self._last_episode_starts
         sampled = super()._sample_action(learning_starts, action_noise, n_envs)
         if self._n_updates > 0:
-            self._note_risk(np.zeros(n_envs, dtype=bool) if starts is None else starts)
+            self._note_risk()
         return sampled
 
     @th.no_grad()
-    def _note_risk(self, starts: np.ndarray) -> None:
-        """
-        Note what the critics expect where the policy really is: replayed states are those of policies that are gone.
-
-        :param starts: which environments have just begun an episode, of shape (n_envs,)
-        """
+    def _note_risk(self) -> None:
+        """Note what the critics expect where the policy really is: replayed states are those of policies that are gone."""
         assert self._last_latent is not None
         grids, actions = self.policy.world_model.features(self._last_latent), self._last_latent.action
         self._violations.append(self.risk(grids, actions).mean() - self.penalty.budget)
         means, _ = self.policy.cost_critic_target(grids, actions)
-        self.penalty.note_prediction(means.mean(0)[th.as_tensor(starts, device=self.device).bool()])
+        self.penalty.note_prediction(means.mean(0))
 
     def risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """

@@ -57,25 +57,18 @@ class FinishedEpisode(NamedTuple):
 
     :param env: index of its environment
     :param cost: undiscounted sum
-    :param discounted_cost: discounted sum, as seen from the first step
     :param length: in steps
     """
 
     env: int
     cost: float
-    discounted_cost: float
     length: int
 
 
 class EpisodeCosts:
-    """
-    Running sums of the episodes under way.
+    """Running sums of the episodes under way."""
 
-    :param discount: of the discounted sums
-    """
-
-    def __init__(self, discount: float = 1.0) -> None:
-        self.discount = discount
+    def __init__(self) -> None:
         self.clear()
 
     def clear(self) -> None:
@@ -84,7 +77,6 @@ class EpisodeCosts:
 
     def _start(self, n_envs: int) -> None:
         self._costs = np.zeros(n_envs)
-        self._discounted = np.zeros(n_envs)
         self._lengths = np.zeros(n_envs, dtype=np.int64)
 
     def add(self, costs: np.ndarray, dones: np.ndarray) -> list[FinishedEpisode]:
@@ -98,11 +90,10 @@ class EpisodeCosts:
         if len(costs) != len(self._costs):
             self._start(len(costs))
         self._costs += costs
-        self._discounted += self.discount**self._lengths * costs
         self._lengths += 1
         return [self._finish(int(env)) for env in np.flatnonzero(dones)]
 
     def _finish(self, env: int) -> FinishedEpisode:
-        episode = FinishedEpisode(env, float(self._costs[env]), float(self._discounted[env]), int(self._lengths[env]))
-        self._costs[env] = self._discounted[env] = self._lengths[env] = 0
+        episode = FinishedEpisode(env, float(self._costs[env]), int(self._lengths[env]))
+        self._costs[env] = self._lengths[env] = 0
         return episode

@@ -1,4 +1,4 @@
-"""What the latest training episodes have cost, beside what was predicted."""
+"""What the latest steps and episodes of the training have cost, beside what was predicted."""
 
 import math
 
@@ -8,45 +8,39 @@ from torch import nn
 
 from sb3_esad.common.costs import EpisodeCosts, FinishedEpisode
 from sb3_esad.common.functional import capped_cvar
+from sb3_esad.common.recent_sums import RecentSums
 
 
 class EpisodeRecord(nn.Module):
     """
-    Ring of the latest episodes; it is part of the saved model, hence made of float buffers.
+    What the present policy costs; it is part of the saved model, hence made of buffers.
 
     :param cost_gamma: discount of the costs
     :param episode_length: in steps, assumed until cost-free episodes have been seen
-    :param window: number of episodes remembered
-    :param road_steps: steps over which the present cost rate is averaged
+    :param window: number of episodes remembered for the spread of their costs
+    :param road_steps: steps over which cost and predictions are averaged
     """
 
     costs: th.Tensor
-    discounted_costs: th.Tensor
     n_episodes: th.Tensor
     n_cost_free: th.Tensor
     mean_length: th.Tensor
-    prediction_sum: th.Tensor
-    prediction_weight: th.Tensor
-
-    cost_rate: th.Tensor
-    rate_weight: th.Tensor
-
-    prediction_decay = 0.99
 
     def __init__(self, cost_gamma: float, episode_length: float, window: int, road_steps: int = 2000) -> None:
         super().__init__()
+        self.cost_gamma = cost_gamma
         self.window = window
-        self.road_steps = road_steps
-        self._under_way = EpisodeCosts(cost_gamma)  # not saved: another number of environments may follow
+        self.recent = RecentSums(("costs", "costs_to_come", "predicted", "predictions"), road_steps)
         self.register_buffer("costs", th.zeros(window))
-        self.register_buffer("discounted_costs", th.zeros(window))
         self.register_buffer("n_episodes", th.zeros(()))
         self.register_buffer("n_cost_free", th.zeros(()))
         self.register_buffer("mean_length", th.tensor(float(episode_length)))
-        self.register_buffer("cost_rate", th.zeros(()))
-        self.register_buffer("rate_weight", th.zeros(()))
-        self.register_buffer("prediction_sum", th.zeros(()))
-        self.register_buffer("prediction_weight", th.zeros(()))
+        self.forget_unfinished()
+
+    def forget_unfinished(self) -> None:
+        """Drop the episodes under way, for the environments have been reset; they are not saved either."""
+        self._under_way = EpisodeCosts()
+        self._weights = np.zeros(0)
 
     @property
     def size(self) -> int:
@@ -65,20 +59,17 @@ class EpisodeRecord(nn.Module):
         :param costs: (n_envs,)
         :param dones: (n_envs,)
         """
-        share = min(len(costs) / self.road_steps, 1.0)
-        self.cost_rate += share * (float(np.mean(costs)) - self.cost_rate)
-        self.rate_weight += share * (1.0 - self.rate_weight)
+        if len(costs) != len(self._weights):
+            self._weights = np.zeros(len(costs))
+        # A cost counts in the discounted cost to come of every earlier step of its episode: 1 + gamma + gamma^2 + ...
+        self._weights = 1.0 + self.cost_gamma * self._weights
+        self.recent.add(len(costs), costs=costs.sum(), costs_to_come=(self._weights * costs).sum())
+        self._weights[np.asarray(dones, dtype=bool)] = 0.0
         for episode in self._under_way.add(costs, dones):
             self._remember(episode)
 
-    def forget_unfinished(self) -> None:
-        """Drop the episodes under way, for the environments have been reset."""
-        self._under_way.clear()
-
     def _remember(self, episode: FinishedEpisode) -> None:
-        slot = int(self.n_episodes) % self.window
-        self.costs[slot] = episode.cost
-        self.discounted_costs[slot] = episode.discounted_cost
+        self.costs[int(self.n_episodes) % self.window] = episode.cost
         self.n_episodes += 1
         if episode.cost == 0:
             self.n_cost_free += 1
@@ -87,45 +78,42 @@ class EpisodeRecord(nn.Module):
     @th.no_grad()
     def note_prediction(self, values: th.Tensor) -> None:
         """
-        Add what the critic expects of whole episodes to a moving average.
+        Add what the critic expects where the policy is.
 
-        :param values: discounted costs expected at episode starts, may be empty
+        :param values: discounted costs to come, one for each environment
         """
-        if values.numel() > 0:
-            share = 1.0 - self.prediction_decay
-            self.prediction_sum += share * (values.mean() - self.prediction_sum)
-            self.prediction_weight += share * (1.0 - self.prediction_weight)
+        self.recent.add(0, predicted=values.sum().item(), predictions=len(values))
 
     @property
     def has_prediction(self) -> bool:
-        """Whether there has been any prediction."""
-        return self.prediction_weight.item() > 0.0
+        """Whether there has been any prediction lately."""
+        return self.recent["predictions"] > 0
 
     def calibration(self, epsilon: float) -> float:
         """
-        Ratio of the predicted to the observed discounted cost of an episode.
+        Ratio of the predicted to the observed discounted cost to come, on the states lately visited.
 
         :param epsilon: > 0, added to both, so that rare costs do not make the ratio jump
         :return: the ratio, 1 as long as there is neither
         """
-        predicted = self.prediction_sum.item() / max(self.prediction_weight.item(), 1e-8)
-        observed = self.discounted_costs[: self.size].mean().item() if self.size else 0.0
+        predicted = self.recent["predicted"] / max(self.recent["predictions"], 1.0)
+        observed = self.recent["costs_to_come"] / max(self.recent["steps"], 1.0)
         return (predicted + epsilon) / (observed + epsilon)
 
     @property
     def seen(self) -> float:
-        """How full the moving average of the cost rate is, from 0 to 1."""
-        return self.rate_weight.item()
+        """How much of the latest steps has been seen, from 0 to 1."""
+        return self.recent.fullness
 
     @property
     def expected_cost(self) -> float:
         """
-        Cost of an episode of full length at the present rate.
+        Cost of an episode of usual length at the present rate.
 
         Not the mean of the latest episodes: once the agent drives well, each lasts long, and crashes of a policy that is gone
         would count for thousands of steps.
         """
-        return self.cost_rate.item() / max(self.rate_weight.item(), 1e-8) * self.episode_length
+        return self.recent["costs"] / max(self.recent["steps"], 1.0) * self.episode_length
 
     def tail_cost(self, risk_level: float) -> float:
         """

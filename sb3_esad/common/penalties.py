@@ -26,7 +26,7 @@ class Penalty(nn.Module, ABC):
     @property
     @abstractmethod
     def calibration(self) -> float:
-        """Predicted over observed discounted cost of an episode."""
+        """Predicted over observed discounted cost to come."""
 
     @property
     @abstractmethod
@@ -73,9 +73,9 @@ class Penalty(nn.Module, ABC):
     @abstractmethod
     def note_prediction(self, values: th.Tensor) -> None:
         """
-        Take note of what the critic expects of whole episodes.
+        Take note of what the critic expects where the policy is.
 
-        :param values: Q^c(s_0, pi(s_0)) at episode starts, may be empty
+        :param values: Q^c(s, a) of the states visited, of shape (n_envs,)
         """
 
     @abstractmethod

@@ -1,0 +1,53 @@
+"""Sums over the latest steps only."""
+
+import torch as th
+from torch import nn
+
+
+class RecentSums(nn.Module):
+    """
+    Sums of several quantities over about the latest ``steps`` steps, which are forgotten block by block.
+
+    Not a moving average: its tail would remember for three times as long what an agent that has learned since then has done.
+
+    :param names: of the quantities
+    :param steps: length of the window
+    :param blocks: into how many parts it is cut; the window holds between ``steps - steps / blocks`` and ``steps``
+    """
+
+    blocks: th.Tensor
+    newest: th.Tensor
+
+    def __init__(self, names: tuple[str, ...], steps: int, blocks: int = 20) -> None:
+        super().__init__()
+        self.names = ("steps", *names)
+        self.steps = steps
+        self.register_buffer("blocks", th.zeros(blocks, len(self.names)))
+        self.register_buffer("newest", th.zeros(()))
+
+    def add(self, steps: int, **values: float) -> None:
+        """
+        Add to the newest block.
+
+        :param steps: steps that have gone by
+        :param values: sums over these steps, by name; those left out are zero
+        """
+        block = self.blocks[int(self.newest)]
+        if block[0] >= self.steps / len(self.blocks):
+            self.newest.add_(1).remainder_(len(self.blocks))
+            block = self.blocks[int(self.newest)].zero_()
+        block += th.tensor([float(steps), *(values.get(name, 0.0) for name in self.names[1:])], device=block.device)
+
+    def __getitem__(self, name: str) -> float:
+        """
+        Sum over the window.
+
+        :param name: of a quantity, or "steps"
+        :return: its sum
+        """
+        return self.blocks[:, self.names.index(name)].sum().item()
+
+    @property
+    def fullness(self) -> float:
+        """How much of the window has been seen, from 0 to 1."""
+        return min(self["steps"] / (self.steps * (1 - 1 / len(self.blocks))), 1.0)
