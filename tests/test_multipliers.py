@@ -173,7 +173,7 @@ def test_uncalibrated_critics_have_no_vote() -> None:
 
 def test_few_episodes_have_no_vote() -> None:
     penalty = make_penalty(road_steps=100)
-    observe_episodes(penalty, cost=9.0, n=19)
+    observe_episodes(penalty, cost=9.0, n=18)
     penalty.note_prediction(th.tensor([9.0]))
     assert not penalty.calibrated
     assert "violation_road" not in penalty.update(1.0)
@@ -220,7 +220,7 @@ def test_road_signal_of_rare_crashes_is_their_share_over_the_risk_level() -> Non
 
 def test_calibration_compares_the_cost_to_come_on_the_same_states() -> None:
     """Costs 0, 1 at discount .5: .5 is to come at the first step, 1 at the second."""
-    record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50, road_steps=100)
+    record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50, road_steps=200)
     drive(record, [0.0, 1.0] * 50, done_every=2)
     assert record.calibration(1e-9) == pytest.approx(0.0, abs=1e-6)
     record.note_prediction(th.tensor([0.5, 1.0]))
