@@ -13,7 +13,7 @@ from sb3_esad.common.penalties import Penalty
 from sb3_esad.common.type_aliases import Logs
 
 ENOUGH_ROAD = 0.2
-"""How full the moving average of the cost rate must be before it has a say."""
+"""How much of the latest steps must have been driven before their cost rate has a say."""
 PATIENCE = 500
 """Updates at the upper bound after which the user is warned."""
 
