@@ -11,7 +11,7 @@ def velocity_reward(speed: float, target_speed: float, sharpness: float) -> floa
 
     :param speed: along the route, negative if against it [m/s]
     :param target_speed: v* [m/s]
-    :param sharpness: lambda [s/m]
+    :param sharpness: lambda [s/m]; the larger, the less speeds far from the target are told apart
     :return: at most 1; 0 at rest and when driving back
     """
     if speed <= 0.0:
