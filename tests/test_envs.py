@@ -169,6 +169,7 @@ def test_traffic_does_not_crash_into_itself_and_merges() -> None:
         ({"frame": "world"}, "choose one of lane, ego"),
         ({"physics_frequency": 7}, "no multiple"),
         ({"physics_frequency": 0}, "physics_frequency is 0; choose a whole number from 1 on"),
+        ({"graded_cost_ttc": 0}, "graded_cost_ttc is 0; choose a time"),
         ({"policy_frequency": 0}, "policy_frequency is 0; choose a whole number from 1 on"),
         ({"policy_frequency": -5}, "policy_frequency is -5; choose"),
         ({"policy_frequency": 2.5}, r"policy_frequency is 2\.5; choose"),

@@ -142,13 +142,9 @@ def test_cost_goes_on_after_an_event() -> None:
 
 
 def test_variance_targets_are_never_negative() -> None:
-    cost, continues, q, q_next, v_next, rho = th.rand(6, 200_000, dtype=th.float64)
+    cost, continues, q, q_next, v_next = th.rand(5, 200_000, dtype=th.float64)
     target = F.cost_variance_target(cost, continues, 3 * q, 3 * q_next, v_next, 0.97, continue_after_cost=0.3)
     assert target.min() >= -1e-12
-    second_moment = cost**2 * (1 + rho)
-    joint = F.graded_joint(cost, second_moment, continues, 0.9)
-    graded = F.expected_squared_error(cost, second_moment, joint, continues, 3 * q, 3 * q_next, 0.97)
-    assert graded.min() >= -1e-12
 
 
 def test_expected_error_of_certain_heads_is_the_sampled_one() -> None:

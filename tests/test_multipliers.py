@@ -16,7 +16,7 @@ from sb3_esad.common.penalties import NoPenalty
 
 def make_penalty(**kwargs: Any) -> AugmentedLagrangian:
     defaults = {"cost_limit": 1.0, "cost_gamma": 1.0, "risk_level": 1.0, "penalty_warmup": 0, "road_steps": 20}
-    return AugmentedLagrangian(**{**defaults, **kwargs})
+    return AugmentedLagrangian(**{**defaults, "lagrangian_multiplier_init": 1.0, "barrier_coef": 1.0, **kwargs})
 
 
 def observe_episodes(penalty: AugmentedLagrangian, cost: float, n: int = 50, length: int = 1) -> None:

@@ -126,24 +126,6 @@ def indicator_joint(cost: th.Tensor, continues: th.Tensor, continue_after_cost: 
     return (continue_after_cost * cost).clamp(min=lowest, max=th.minimum(cost, continues))
 
 
-def graded_joint(cost: th.Tensor, second_moment: th.Tensor, continues: th.Tensor, continue_after_cost: float) -> th.Tensor:
-    """
-    E[c k] of any cost >= 0 and of the continuation, from their moments.
-
-    The estimate rho E[c] is kept within the bound of Cauchy and Schwarz on the covariance.
-
-    :param cost: E[c] >= 0
-    :param second_moment: E[c^2] >= E[c]^2
-    :param continues: E[k] in [0, 1]
-    :param continue_after_cost: rho = P(k = 1 | c > 0)
-    :return: E[c k], of the common shape
-    """
-    independent = continues * cost
-    bound = (continues * (1.0 - continues) * (second_moment - cost**2)).clamp(min=0.0).sqrt()
-    covariance = (continue_after_cost * cost - independent).clamp(min=-bound, max=bound)
-    return independent + covariance
-
-
 def expected_squared_error(
     cost: th.Tensor,
     second_moment: th.Tensor,
@@ -160,7 +142,7 @@ def expected_squared_error(
 
     :param cost: E[c]
     :param second_moment: E[c^2]
-    :param joint: E[c k], see :func:`indicator_joint` and :func:`graded_joint`
+    :param joint: E[c k], see :func:`indicator_joint`
     :param continues: E[k]
     :param mean: Q, the critic's current value
     :param next_mean: Q', the value of the state reached

@@ -1,6 +1,7 @@
 """Configurations are plain dictionaries whose keys are all known."""
 
 import difflib
+from numbers import Integral
 from typing import Any
 
 
@@ -24,3 +25,20 @@ def merge_config(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, A
             value = merge_config(defaults[key], value)
         merged[key] = value
     return merged
+
+
+def check_config(config: dict[str, Any]) -> None:
+    """
+    Refuse values with which no scenario can be driven.
+
+    :param config: complete configuration
+    :raises ValueError: at the first such value
+    """
+    physics, policy = config["physics_frequency"], config["policy_frequency"]
+    for name, frequency in (("physics_frequency", physics), ("policy_frequency", policy)):
+        if not isinstance(frequency, Integral) or frequency < 1:
+            raise ValueError(f"{name} is {frequency!r}; choose a whole number from 1 on")
+    if physics % policy:
+        raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
+    if not config["graded_cost_ttc"] > 0:
+        raise ValueError(f"graded_cost_ttc is {config['graded_cost_ttc']!r}; choose a time to collision above 0 s")

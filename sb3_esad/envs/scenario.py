@@ -2,7 +2,6 @@
 
 import math
 from collections import Counter
-from numbers import Integral
 from typing import Any
 
 import gymnasium
@@ -11,7 +10,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_esad.envs import rewards
-from sb3_esad.envs.config import merge_config
+from sb3_esad.envs.config import check_config, merge_config
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
@@ -50,12 +49,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         if render_mode not in (None, *self.metadata["render_modes"]):
             raise ValueError(f"unknown render_mode {render_mode!r}; choose one of {self.metadata['render_modes']} or None")
         self.config = merge_config(self.default_config(), config or {})
-        physics, policy = self.config["physics_frequency"], self.config["policy_frequency"]
-        for name, frequency in (("physics_frequency", physics), ("policy_frequency", policy)):
-            if not isinstance(frequency, Integral) or frequency < 1:
-                raise ValueError(f"{name} is {frequency!r}; choose a whole number from 1 on")
-        if physics % policy:
-            raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
+        check_config(self.config)
         self.render_mode = render_mode
         self.controls = Controls(*(self.config[name] for name in Controls.__dataclass_fields__))
         self.observation: Observation = OBSERVATIONS[observation](self.config)
