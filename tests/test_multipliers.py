@@ -119,9 +119,9 @@ def test_both_signals_move_the_multiplier() -> None:
     calibrate(penalty, 5.0)
     for _ in range(100):
         logs = penalty.update(99.0)
-    assert logs["violation_model"] == logs["violation_road"] == 2.0
-    assert penalty.multiplier.item() == pytest.approx(3.0, abs=1e-4)
-    for _ in range(24):
+    assert logs["violation_model"] == logs["violation_road"] == 1.0
+    assert penalty.multiplier.item() == pytest.approx(2.0, abs=1e-4)
+    for _ in range(48):
         penalty.update(th.tensor(99.0), gradient_steps=101)
     assert penalty.multiplier.item() == 50.0
 
@@ -157,20 +157,6 @@ def test_steps_scale_with_gradient_steps() -> None:
     th.testing.assert_close(one.n_updates, four.n_updates)
 
 
-@pytest.mark.parametrize(("times_the_limit", "low", "high"), [(0.25, -1.0, -0.5), (1.0, -0.4, 0.4), (4.0, 0.8, 2.0)])
-def test_rare_costs_at_the_limit_pull_neither_up_nor_down(times_the_limit: float, low: float, high: float) -> None:
-    """On average over many windows of 13 episodes, most of which hold no cost at all."""
-    penalty, random = make_penalty(cost_limit=0.05, risk_level=0.5, road_steps=200), np.random.default_rng(0)
-    signals = []
-    for _ in range(1500):
-        crashes = random.random(10) < 0.025 * times_the_limit
-        for step in range(15):
-            last = np.full(10, step == 14)
-            penalty.observe(crashes * last, last)
-        signals.append(penalty.update(0.0).get("violation_road", 0.0))
-    assert low < np.mean(signals) < high
-
-
 def test_uncalibrated_critics_have_no_vote() -> None:
     penalty = make_penalty()
     assert "violation_model" not in penalty.update(1.0)
@@ -193,7 +179,7 @@ def test_few_episodes_have_no_vote() -> None:
     assert "violation_road" not in penalty.update(1.0)
     assert penalty.multiplier.item() == 1.0 and penalty.mean_violation.item() == 0.0
     observe_episodes(penalty, cost=9.0, n=10)
-    assert penalty.update(1.0)["violation_road"] == 2.0
+    assert penalty.update(1.0)["violation_road"] == 1.0
 
 
 def test_warm_up_and_missing_updates_hold_the_multiplier() -> None:

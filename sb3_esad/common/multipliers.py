@@ -14,8 +14,6 @@ from sb3_esad.common.type_aliases import Logs
 
 ENOUGH_ROAD = 0.2
 """How much of the latest steps must have been driven before their cost rate has a say."""
-SIGNAL_BOUNDS = (-1.0, 2.0)
-"""Largest pull down and up. No cost at all gives -1; bounded at +1, one rare cost would weigh no more than as much quiet."""
 PATIENCE = 500
 """Updates at the upper bound after which the user is warned."""
 
@@ -163,8 +161,7 @@ class AugmentedLagrangian(Penalty):
         if self.episodes.seen >= ENOUGH_ROAD:
             excess = self.episodes.tail_cost(self.risk_level) - self.cost_limit
             signals["violation_road"] = excess / max(self.cost_limit, 0.02)
-        low, high = SIGNAL_BOUNDS
-        return {name: min(max(signal, low), high) for name, signal in signals.items()}
+        return {name: min(max(signal, -1.0), 1.0) for name, signal in signals.items()}
 
     def _move(self, signals: list[float], gradient_steps: int) -> None:
         mean = sum(signals) / len(signals)
