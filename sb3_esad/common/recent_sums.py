@@ -36,7 +36,8 @@ class RecentSums(nn.Module):
         if block[0] >= self.steps / len(self.blocks):
             self.newest.add_(1).remainder_(len(self.blocks))
             block = self.blocks[int(self.newest)].zero_()
-        block += th.tensor([float(steps), *(values.get(name, 0.0) for name in self.names[1:])], device=block.device)
+        row = {**dict.fromkeys(self.names, 0.0), "steps": float(steps), **values}
+        block += th.tensor(list(row.values()), device=block.device)
 
     def __getitem__(self, name: str) -> float:
         """
