@@ -28,7 +28,7 @@ class RecordingPenalty(AugmentedLagrangian):
     """Notes how often it is called, and with what."""
 
     def __init__(self) -> None:
-        super().__init__(cost_limit=0.1, min_episodes=1, penalty_warmup=0, road_steps=10)
+        super().__init__(0.1, lagrangian_multiplier_init=1.0, min_episodes=1, penalty_warmup=0, road_steps=10)
         self.updates: list[tuple[Any, int]] = []
         self.n_observed = 0
 
