@@ -192,6 +192,21 @@ def test_targets_follow_slowly() -> None:
             th.testing.assert_close(moved, 0.75 * before + 0.25 * new)
 
 
+def test_critics_do_not_learn_through_their_own_targets(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They bootstrap from themselves, and would otherwise move what is to come towards what they expect now."""
+    model = make_model().learn(24)
+    learned: list[bool] = []
+    for critic in (model.policy.critic, model.policy.cost_critic):
+
+        def spy(grid: th.Tensor, action: th.Tensor, *targets: th.Tensor, loss: Any = critic.loss) -> Any:
+            learned.extend(target.requires_grad for target in targets)
+            return loss(grid, action, *targets)
+
+        monkeypatch.setattr(critic, "loss", spy)
+    model._update_behavior(*imagine(model))
+    assert learned == [False] * 6
+
+
 class KnownCritic(th.nn.Module):
     """More is better: Q = a."""
 

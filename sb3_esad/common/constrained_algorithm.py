@@ -142,8 +142,8 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         """Note what the critics expect where the policy really is: replayed states are those of policies that are gone."""
         assert self._last_latent is not None
         grids, actions = self.policy.world_model.features(self._last_latent), self._last_latent.action
-        self._violations.append(self.risk(grids, actions).mean() - self.penalty.budget)
-        means, _ = self.policy.cost_critic_target(grids, actions)
+        means, variance = self.policy.cost_critic_target(grids, actions)
+        self._violations.append(self._risk(means, variance).mean() - self.penalty.budget)
         self.penalty.note_prediction(means.mean(0))
 
     def risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -154,9 +154,10 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         :param actions: their actions, of shape (N, A)
         :return: shape (N,)
         """
-        critic = self.policy.cost_critic_target
-        means, variance = critic(grids, actions)
-        return capped_cvar(means, variance, self.risk_level, critic.bound).max(0).values
+        return self._risk(*self.policy.cost_critic_target(grids, actions))
+
+    def _risk(self, means: th.Tensor, variance: th.Tensor) -> th.Tensor:
+        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic_target.bound).max(0).values
 
     def _barrier(self, risk: th.Tensor) -> th.Tensor:
         """Residual at each imagined step, of shape (H, N); the last m steps look too far ahead and count as safe."""

@@ -1,8 +1,8 @@
 """
 What the critics of ESAD-LEND learn: targets from imagined trajectories and from recorded transitions.
 
-Critics bootstrap from themselves as they are, not from their slow averages: at a few hundred updates the lag of an average,
-compounded by the bootstrap, kept the estimates at what early policies deserved (docs/experiments.md, section 7).
+Critics bootstrap from themselves as they are: with a bootstrap from their slow averages driving was learned later
+(docs/experiments.md, section 7).
 """
 
 from typing import NamedTuple
