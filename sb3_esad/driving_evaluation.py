@@ -81,7 +81,7 @@ class SeededEpisodes(gym.Wrapper[Any, Any, Any, Any]):
         self._sums["cost"] += float(self._read_costs([info])[0])
         self._sums["steps"] += 1
         if terminated or truncated:
-            self.records.append({"seed": self.seed, **self._sums, **info.get("driving", {})})
+            self.records.append({"seed": self.seed, **info.get("driving", {}), **self._sums})
             self._running = False
         return observation, reward, terminated, truncated, info
 

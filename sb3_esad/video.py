@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 
+from sb3_esad.common.costs import CostReader
 from sb3_esad.common.save_util import whole_file
 from sb3_esad.dream import DreamingDriver
 from sb3_esad.driving_evaluation import DRIVERS, check_scenario, check_spaces
@@ -100,12 +101,12 @@ def _drive(env: gym.Env[Any, Any], name: str, seed: int) -> Iterator[Picture]:
 
 def _drive_dreaming(env: gym.Env[Any, Any], driver: DreamingDriver, seed: int) -> Iterator[Picture]:
     observation, info = env.reset(seed=seed)
-    verdict, cost = "", 0.0
+    verdict, cost, read_costs = "", 0.0, CostReader(driver.model.cost_key)
     while not verdict:
         action = driver(observation)
         yield _frame(env, driver, observation, info, cost, verdict)
         observation, _, terminated, truncated, info = env.step(action)
-        cost += info["cost"]
+        cost += float(read_costs([info])[0])
         if terminated or truncated:
             verdict = _verdict(info, truncated)
     driver(observation)
@@ -134,7 +135,7 @@ def _frame(
 
 
 def _gauges(scenario: Any, driver: DreamingDriver, info: dict[str, Any], cost: float) -> list[Gauge]:
-    config, speed, step_cost = scenario.config, info["speed"], info.get("cost", 0.0)
+    config, speed, step_cost = scenario.config, info["speed"], float(info.get(driver.model.cost_key, 0.0))
     risk, limit = driver.risk(), driver.model.cost_limit
     budget = driver.model.penalty.budget
     allowed = "no limit" if limit is None else f"budget {100 * budget:.2f} %"

@@ -162,7 +162,7 @@ def test_the_rate_is_the_third_argument_as_everywhere_in_sb3() -> None:
 
 
 def test_the_rate_is_held_and_falls_to_zero() -> None:
-    assert [FALLING_RATE(progress) for progress in (1.0, 0.5, 0.25, 0.0)] == pytest.approx([0.006, 0.006, 0.003, 0.0])
+    assert [FALLING_RATE(progress) for progress in (1.0, 0.5, 0.25, 0.0, -0.1)] == pytest.approx([0.006, 0.006, 0.003, 0, 0])
     model = make_model(learning_rate=FALLING_RATE)
     assert inspect.signature(ESADLEND.__mro__[1]).parameters["learning_rate"].default is FALLING_RATE
     assert {group["lr"] for each in model._optimizers().values() for group in each.param_groups} == {0.006}
@@ -356,12 +356,30 @@ def test_penalty_takes_part_whatever_callback_the_user_has() -> None:
 
 def test_a_violation_is_taken_once() -> None:
     model = make_model(learning_starts=10).learn(12)
-    assert model._n_updates == 1 and model.take_violation() is None, "the critics knew nothing when these steps were made"
+    assert model._n_updates == 1
+    assert model.take_violation() == (None, 1), "the critics knew nothing when these steps were made"
     for _ in range(2):
         model._sample_action(0)
-    violation = model.take_violation()
-    assert violation is not None and violation.isfinite()
-    assert model.take_violation() is None
+    violation, n_updates = model.take_violation()
+    assert violation is not None and violation.isfinite() and n_updates == 0
+    assert model.take_violation() == (None, 0)
+
+
+def test_short_pieces_move_the_multiplier_as_one_long_one() -> None:
+    whole, pieces = make_model(penalty_warmup=0).learn(80), make_model(penalty_warmup=0)
+    for piece in range(20):
+        pieces.learn(4, reset_num_timesteps=piece == 0)
+    for model in (whole, pieces):
+        assert isinstance(model.penalty, AugmentedLagrangian)
+        assert model.penalty.n_updates.item() == model._n_updates - 1
+
+
+def test_random_steps_of_a_second_training_are_not_predicted() -> None:
+    model = make_model().learn(40)
+    assert isinstance(model.penalty, AugmentedLagrangian)
+    before = model.penalty.episodes.recent["predictions"]
+    model.learn(20)  # as many as learning_starts
+    assert model.penalty.episodes.recent["predictions"] == before > 0
 
 
 def test_as_many_updates_as_steps() -> None:

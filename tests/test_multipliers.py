@@ -194,6 +194,16 @@ def test_warm_up_and_missing_updates_hold_the_multiplier() -> None:
     assert penalty.multiplier.item() > 1.0
 
 
+def test_an_episode_that_began_with_random_actions_is_never_remembered() -> None:
+    record = EpisodeRecord(cost_gamma=0.5, episode_length=200, window=50, road_steps=10_000)
+    record.pass_over(np.array([False, True]))
+    for step in range(6):
+        record.observe(np.array([0.0, 0.0]), np.array([step == 1, step == 3]))
+    assert record.size == 1 and record.episode_length == 4, "two steps of an episode are not its length"
+    record.observe(np.zeros(2), np.array([True, False]))
+    assert record.size == 2 and record.episode_length == 4.5
+
+
 def drive(record: EpisodeRecord, costs: list[float], done_every: int) -> None:
     """Observe one cost after another in one environment."""
     for step, cost in enumerate(costs, start=1):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback
+from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, IdentityEnvBox, SimpleMultiObsEnv
 from stable_baselines3.common.evaluation import evaluate_policy
@@ -208,6 +208,15 @@ def test_callbacks_can_stop() -> None:
     assert model.num_timesteps == 1
     model.learn(40, reset_num_timesteps=False)
     assert model.num_timesteps == 41
+
+
+def test_to_go_on_after_a_callback_has_stopped_opens_an_episode() -> None:
+    """SB3 does not store the step at which a callback stops, here the last of an episode."""
+    model = ESADLEND("MlpPolicy", CountingEnv(), **TINY)
+    model.learn(40, callback=StopTrainingOnMaxEpisodes(1))
+    model.learn(5, reset_num_timesteps=False)
+    assert model.replay_buffer.observations[:11, 0, 0].tolist() == [*range(6), *range(5)]
+    assert np.flatnonzero(model.replay_buffer.episode_starts[:11, 0]).tolist() == [0, 6]
 
 
 def test_checkpoints_keep_the_replay_buffer(tmp_path: Any) -> None:

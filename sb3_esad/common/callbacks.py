@@ -29,31 +29,27 @@ class LagrangeCallback(BaseCallback):
     Shows the penalty the costs of every step of the policy and lets it move its multiplier once per collected rollout.
 
     The model has a ``penalty``, a ``replay_buffer`` that reads costs and a ``take_violation()`` that returns the mean of
-    Gamma - d since its last call, or None if there was no update. Everything that must be remembered is in the penalty,
-    which is saved with the model.
+    Gamma - d since its last call, or None if there was no update, and the number of updates since then. Everything that must
+    be remembered is in the model and its penalty, and is saved with them.
     """
 
     model: Any
-
-    def _init_callback(self) -> None:
-        self._n_updates_seen = self.model._n_updates
 
     def _on_training_start(self) -> None:
         if self.model._last_episode_starts.all():
             self.model.penalty.forget_unfinished()
 
     def _on_step(self) -> bool:
+        dones = self.locals["dones"]
         # What random actions have cost says nothing about the policy
-        if self.num_timesteps > self.model.learning_starts:
-            self.model.penalty.observe(self.model.replay_buffer.read_costs(self.locals["infos"]), self.locals["dones"])
+        if self.num_timesteps - len(dones) >= self.model.learning_starts:
+            self.model.penalty.observe(self.model.replay_buffer.read_costs(self.locals["infos"]), dones)
+        else:
+            self.model.penalty.pass_over(dones)
         return True
 
     def _on_rollout_end(self) -> None:
-        n_updates = self.model._n_updates
-        violation = self.model.take_violation()
-        logs = self.model.penalty.update(violation, n_updates - self._n_updates_seen)
-        self._n_updates_seen = n_updates
-        for name, value in logs.items():
+        for name, value in self.model.penalty.update(*self.model.take_violation()).items():
             self.logger.record(f"train/{name}", value)
 
 

@@ -74,6 +74,7 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         self.barrier_decay = barrier_decay
         self.barrier_steps = barrier_steps
         self.barrier_coef = barrier_coef
+        self._n_updates_penalized = 0
         if _init_setup_model:
             self._setup_model()
 
@@ -120,20 +121,23 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(prepend(LagrangeCallback(), callback), progress_bar)
 
-    def take_violation(self) -> th.Tensor | None:
+    def take_violation(self) -> tuple[th.Tensor | None, int]:
         """
         Hand over how far the expected risk exceeded the budget since the last call.
 
-        :return: mean of Gamma - d over the states visited, None if there were none or the critics have not been updated yet
+        :return: mean of Gamma - d over the states visited, None if there were none or the critics have not been updated yet,
+            and the number of updates since the last call
         """
         violations, self._violations = self._violations, []
-        return th.stack(violations).mean() if violations else None
+        # Not counted by the callback: the last update of one learn() is seen by the first rollout of the next
+        n_updates, self._n_updates_penalized = self._n_updates - self._n_updates_penalized, self._n_updates
+        return th.stack(violations).mean() if violations else None, n_updates
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         sampled = super()._sample_action(learning_starts, action_noise, n_envs)
-        if self._n_updates > 0:
+        if self._n_updates > 0 and self.num_timesteps >= learning_starts:
             self._note_risk()
         return sampled
 

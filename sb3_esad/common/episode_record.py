@@ -41,6 +41,7 @@ class EpisodeRecord(nn.Module):
         """Drop the episodes under way, for the environments have been reset; they are not saved either."""
         self._under_way = EpisodeCosts()
         self._weights = np.zeros(0)
+        self._whole = np.zeros(0, dtype=bool)
 
     @property
     def size(self) -> int:
@@ -61,12 +62,24 @@ class EpisodeRecord(nn.Module):
         """
         if len(costs) != len(self._weights):
             self._weights = np.zeros(len(costs))
+        if len(costs) != len(self._whole):
+            self._whole = np.ones(len(costs), dtype=bool)
         # A cost counts in the discounted cost to come of every earlier step of its episode: 1 + gamma + gamma^2 + ...
         self._weights = 1.0 + self.cost_gamma * self._weights
         self.recent.add(len(costs), costs=costs.sum(), costs_to_come=(self._weights * costs).sum())
         self._weights[np.asarray(dones, dtype=bool)] = 0.0
         for episode in self._under_way.add(costs, dones):
-            self._remember(episode)
+            if self._whole[episode.env]:
+                self._remember(episode)
+            self._whole[episode.env] = True
+
+    def pass_over(self, dones: np.ndarray) -> None:
+        """
+        Let a step of random actions go by; an episode that began with them is never remembered, for it is no whole one.
+
+        :param dones: (n_envs,)
+        """
+        self._whole = np.array(dones, dtype=bool)
 
     def _remember(self, episode: FinishedEpisode) -> None:
         self.costs[int(self.n_episodes) % self.window] = episode.cost

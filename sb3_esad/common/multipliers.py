@@ -137,6 +137,9 @@ class AugmentedLagrangian(Penalty):
     def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
         self.episodes.observe(costs, dones)
 
+    def pass_over(self, dones: np.ndarray) -> None:
+        self.episodes.pass_over(dones)
+
     def forget_unfinished(self) -> None:
         self.episodes.forget_unfinished()
 
@@ -152,7 +155,7 @@ class AugmentedLagrangian(Penalty):
             self._move(list(signals.values()), gradient_steps)
         self.n_updates += gradient_steps
         self._watch_bound(gradient_steps)
-        return self._logs(signals)
+        return {**self._logs(signals), "cvar": float(violation) + self.budget}
 
     def _signals(self, violation: float) -> Logs:
         signals = {}

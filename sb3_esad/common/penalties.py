@@ -67,6 +67,14 @@ class Penalty(nn.Module, ABC):
         """
 
     @abstractmethod
+    def pass_over(self, dones: np.ndarray) -> None:
+        """
+        Let a step of random actions go by, whose costs say nothing about the policy.
+
+        :param dones: (n_envs,)
+        """
+
+    @abstractmethod
     def forget_unfinished(self) -> None:
         """Drop the episodes under way, for the environments have been reset."""
 
@@ -114,6 +122,9 @@ class NoPenalty(Penalty):
         return th.ones_like(risk, dtype=th.bool)
 
     def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+        pass
+
+    def pass_over(self, dones: np.ndarray) -> None:
         pass
 
     def forget_unfinished(self) -> None:

@@ -12,7 +12,7 @@ class RecentSums(nn.Module):
 
     :param names: of the quantities
     :param steps: length of the window
-    :param blocks: into how many parts it is cut; the window holds between ``steps - steps / blocks`` and ``steps``
+    :param blocks: into how many parts it is cut; the window holds ``steps`` to within a part, or to within one call of ``add``
     """
 
     blocks: th.Tensor

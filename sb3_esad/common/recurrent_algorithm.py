@@ -12,7 +12,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
-from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
@@ -43,7 +43,7 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
     :param learning_rate: of all networks, a number or a function of the remaining progress
     :param buffer_size: number of steps to remember
     :param learning_starts: steps of random actions of random amplitude, each held for ``random_hold`` steps, before learning;
-        a loaded model without its replay buffer first collects as many with its own actions
+        a loaded model without its replay buffer that goes on (``reset_num_timesteps=False``) first collects as many of its own
     :param batch_size: windows in a batch
     :param sequence_length: steps in a window
     :param tau: share of the learned networks in their targets at each update
@@ -163,6 +163,19 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
         self._last_latent = None
         self._random_actions: np.ndarray | None = None
         self._episode_costs = EpisodeCosts()
+
+    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
+        """
+        Collect steps.
+
+        :param args: see SB3's ``OffPolicyAlgorithm.collect_rollouts``
+        :param kwargs: likewise
+        :return: how many there were, and whether to go on
+        """
+        rollout = super().collect_rollouts(*args, **kwargs)
+        if not rollout.continue_training:
+            self._last_obs = None  # the step at which a callback stopped was not stored: to go on takes new episodes
+        return rollout
 
     # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
 

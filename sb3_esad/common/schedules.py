@@ -21,10 +21,11 @@ class HoldThenFall:
         """
         Give the value.
 
-        :param progress_remaining: share of the training that lies ahead, from 1 to 0
+        :param progress_remaining: share of the training that lies ahead, from 1 to 0 or, where the last rollout
+            goes on beyond the end, below
         :return: the value at this moment
         """
-        return self.start * min(1.0, progress_remaining / (1.0 - self.hold))
+        return self.start * min(1.0, max(progress_remaining, 0.0) / (1.0 - self.hold))
 
     def __repr__(self) -> str:
         return f"HoldThenFall(start={self.start}, hold={self.hold})"

@@ -1,8 +1,17 @@
 """Configurations are plain dictionaries whose keys are all known."""
 
 import difflib
-from numbers import Integral
+import math
+from numbers import Integral, Real
 from typing import Any
+
+import numpy as np
+
+POSITIVE = {
+    *("duration", "route_length", "target_speed", "max_speed", "max_acceleration", "max_braking"),
+    *("max_wheel_angle", "max_lateral_acceleration", "lane_tolerance", "graded_cost_ttc"),
+}
+POSITIVE_PAIRS = {"image_shape", "metres_per_pixel"}
 
 
 def merge_config(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -40,5 +49,14 @@ def check_config(config: dict[str, Any]) -> None:
             raise ValueError(f"{name} is {frequency!r}; choose a whole number from 1 on")
     if physics % policy:
         raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
-    if not config["graded_cost_ttc"] > 0:
-        raise ValueError(f"graded_cost_ttc is {config['graded_cost_ttc']!r}; choose a time to collision above 0 s")
+    for name in POSITIVE & config.keys():
+        if not _is_positive(config[name]):
+            raise ValueError(f"{name} is {config[name]!r}; choose a number above 0")
+    for name in POSITIVE_PAIRS & config.keys():
+        pair = config[name]
+        if np.shape(pair) != (2,) or not all(map(_is_positive, pair)):
+            raise ValueError(f"{name} is {pair!r}; choose two numbers above 0, along the road and across it")
+
+
+def _is_positive(value: Any) -> bool:
+    return isinstance(value, Real) and 0 < float(value) < math.inf

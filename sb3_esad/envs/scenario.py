@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs import rewards
 from sb3_esad.envs.config import check_config, merge_config
+from sb3_esad.envs.geometry import wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
@@ -133,8 +134,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     @property
     def heading_error(self) -> float:
         """Angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
-        angle = self.traffic.heading[EGO] - self.road.heading[self.traffic.lane[EGO]]
-        return float((angle + math.pi) % (2 * math.pi) - math.pi)
+        return float(wrap_angle(self.traffic.heading[EGO] - self.road.heading[self.traffic.lane[EGO]]))
 
     @property
     def remaining(self) -> float:

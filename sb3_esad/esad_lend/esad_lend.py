@@ -1,10 +1,9 @@
 """ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
 
 import math
-from typing import Any, ClassVar
+from typing import Any
 
 import torch as th
-from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.checks import require
@@ -15,7 +14,6 @@ from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
-from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
     Transitions,
     cost_targets,
@@ -50,12 +48,6 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
-
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": MlpPolicy,
-        "CnnPolicy": CnnPolicy,
-        "MultiInputPolicy": MultiInputPolicy,
-    }
 
     def __init__(
         self,
@@ -159,7 +151,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         usual_risk = risk[0, : risk.shape[1] // 2]  # the other half starts shortly before a cost
         return {
             "actor_loss": loss.item(),
-            "cvar": usual_risk.mean().item(),
+            "imagined_risk": usual_risk.mean().item(),
             "barrier_residual": barrier.relu().mean().item(),
             "entropy": -log_prob.mean().item(),
             "return_scale": self.policy.critic.scale.item(),
