@@ -34,5 +34,5 @@ benchmark: $(INSTALLED)
 $(INSTALLED): setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[tests]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[demo,tests]"
 	@touch $@

@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_esad.common.evaluation import evaluate_policy
+from sb3_esad.common.save_util import whole_file
 
 
 def prepend(first: BaseCallback, callback: MaybeCallback) -> list[BaseCallback]:
@@ -162,7 +163,6 @@ class CostEvalCallback(EvalCallback):
         if self.verbose >= 1:
             print("New best model!")
         if self.best_model_save_path is not None:
-            unfinished = os.path.join(self.best_model_save_path, "unfinished_model.zip")
-            self.model.save(unfinished)
-            os.replace(unfinished, os.path.join(self.best_model_save_path, "best_model.zip"))
+            with whole_file(os.path.join(self.best_model_save_path, "best_model.zip")) as target:
+                self.model.save(target)
         return self.callback_on_new_best is None or self.callback_on_new_best.on_step()

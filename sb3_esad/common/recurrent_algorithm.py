@@ -1,9 +1,6 @@
 """An off-policy algorithm whose policy remembers, and whose every step may have a cost."""
 
-import io
-import pathlib
-from collections.abc import Iterable
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import torch as th
@@ -20,10 +17,8 @@ from sb3_esad.common.checks import refuse_blank_images, refuse_unknown, require
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.policies import LatentPolicy
-from sb3_esad.common.save_util import check_saved_model, whole_file
 from sb3_esad.common.type_aliases import LatentState
-
-SelfRecurrent = TypeVar("SelfRecurrent", bound="RecurrentOffPolicyAlgorithm")
+from sb3_esad.common.whole_model_files import WholeModelFiles
 
 NOT_OFFERED = {
     "use_sde": "gSDE is not offered, pass an action_noise instead",
@@ -34,7 +29,7 @@ NOT_OFFERED = {
 """Arguments that other algorithms of SB3 have, and what to do without them."""
 
 
-class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
+class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
     """
     SB3's off-policy algorithm with what it lacks: a memory between two actions, windows of steps to learn from, and costs.
 
@@ -67,6 +62,7 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
     :raises ValueError: if an argument is out of its range
     """
 
+    saved_mark = "random_hold"
     policy: LatentPolicy
     replay_buffer: SequenceReplayBuffer
     action_space: spaces.Box
@@ -256,44 +252,6 @@ class RecurrentOffPolicyAlgorithm(OffPolicyAlgorithm):
             self._episode_costs.clear()
         refuse_blank_images(self.policy.world_model.images(self._last_obs))
         return result
-
-    # Saving
-
-    def save(
-        self,
-        path: str | pathlib.Path | io.BufferedIOBase,
-        exclude: Iterable[str] | None = None,
-        include: Iterable[str] | None = None,
-    ) -> None:
-        """
-        Save the model to a zip that is there as a whole or not at all.
-
-        :param path: where to; ``.zip`` is added to a path without a suffix
-        :param exclude: attributes to leave out beside the usual ones
-        :param include: attributes to save although they are usually left out
-        """
-        with whole_file(path, ".zip") as target:
-            super().save(target, exclude, include)
-
-    @classmethod
-    def load(
-        cls: type[SelfRecurrent], path: str | pathlib.Path | io.BufferedIOBase, *args: Any, **kwargs: Any
-    ) -> SelfRecurrent:
-        """
-        Load a saved model.
-
-        :param path: its zip; ``.zip`` may be left out
-        :param args: see SB3's ``BaseAlgorithm.load``
-        :param kwargs: likewise
-        :return: the model
-        :raises ValueError: if the file is missing, damaged, of another version or holds something else
-        """
-        check_saved_model(path, cls.__name__, mark="random_hold")
-        try:
-            return super().load(path, *args, **kwargs)
-        except (KeyError, RuntimeError) as error:
-            reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
-            raise ValueError(f"The model in {path} {reason} ({str(error).partition(chr(10))[0]}).") from error
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]

@@ -1,0 +1,52 @@
+"""Saved models that are there as a whole or not at all, and foreign ones that are refused with a reason."""
+
+import io
+import pathlib
+from collections.abc import Iterable
+from typing import Any, ClassVar, TypeVar
+
+from stable_baselines3.common.base_class import BaseAlgorithm
+
+from sb3_esad.common.save_util import check_saved_model, whole_file
+
+SelfWhole = TypeVar("SelfWhole", bound="WholeModelFiles")
+
+
+class WholeModelFiles(BaseAlgorithm):
+    """Saving and loading of an algorithm; :attr:`saved_mark` is an attribute by which its models are told from others."""
+
+    saved_mark: ClassVar[str]
+
+    def save(
+        self,
+        path: str | pathlib.Path | io.BufferedIOBase,
+        exclude: Iterable[str] | None = None,
+        include: Iterable[str] | None = None,
+    ) -> None:
+        """
+        Save the model to a zip that is there as a whole or not at all.
+
+        :param path: where to; ``.zip`` is added to a path without a suffix
+        :param exclude: attributes to leave out beside the usual ones
+        :param include: attributes to save although they are usually left out
+        """
+        with whole_file(path, ".zip") as target:
+            super().save(target, exclude, include)
+
+    @classmethod
+    def load(cls: type[SelfWhole], path: str | pathlib.Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> SelfWhole:
+        """
+        Load a saved model.
+
+        :param path: its zip; ``.zip`` may be left out
+        :param args: see SB3's ``BaseAlgorithm.load``
+        :param kwargs: likewise
+        :return: the model
+        :raises ValueError: if the file is missing, damaged, of another version or holds something else
+        """
+        check_saved_model(path, cls.__name__, mark=cls.saved_mark)
+        try:
+            return super().load(path, *args, **kwargs)
+        except (KeyError, RuntimeError) as error:
+            reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
+            raise ValueError(f"The model in {path} {reason} ({str(error).partition(chr(10))[0]}).") from error
