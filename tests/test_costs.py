@@ -38,7 +38,9 @@ def test_missing_cost_points_to_crashed() -> None:
         CostReader()([{"crashed": True}])
 
 
-@pytest.mark.parametrize("cost", [float("nan"), float("inf"), -1.0, [1.0], np.zeros(2), np.zeros(1), "high", None, {}])
+@pytest.mark.parametrize(
+    "cost", [float("nan"), float("inf"), -1.0, [1.0], [[1.0], [1.0, 0.0]], np.zeros(2), np.zeros(1), "high", None, {}]
+)
 def test_refuses_what_is_not_a_cost(cost: Any) -> None:
     with pytest.raises(ValueError, match=r'^info\["cost"\] is .*; a cost must be one number from 0 to 1, or a bool\.$'):
         CostReader()([{"cost": cost}])

@@ -90,6 +90,9 @@ def test_missing_costs_are_zero_with_one_warning() -> None:
         ("barrier_steps", 0, ">= 1"),
         ("barrier_coef", -1.0, ">= 0"),
         ("uniform_action_prob", 1.1, "[0, 1]"),
+        ("replay_critic_coef", -1.0, ">= 0"),
+        ("replay_cost_critic_coef", -1.0, ">= 0"),
+        ("target_entropy", "low", '"auto"'),
         ("lambda_lr", -0.1, ">= 0"),
         ("penalty_coef", -0.1, ">= 0"),
         ("lagrangian_multiplier_init", 60.0, "within 0.05 and 50"),
@@ -104,6 +107,13 @@ def test_arguments_out_of_range(name: str, value: Any, remedy: str) -> None:
     with pytest.raises(ValueError) as error:
         make_model(**{name: value})
     check_sentence(error, f"{name} is {value!r}", "choose", remedy)
+
+
+@pytest.mark.parametrize(("name", "value"), [("cost_weight", 0.0), ("foreground_weight", -1.0), ("open_loop_length", 0)])
+def test_arguments_of_the_world_model_out_of_range(name: str, value: Any) -> None:
+    with pytest.raises(ValueError) as error:
+        make_model(policy_kwargs={**TINY["policy_kwargs"], "world_model_kwargs": {name: value}})
+    check_sentence(error, f"{name} is {value!r}", "choose")
 
 
 def test_risk_level_is_checked_without_a_limit_too() -> None:

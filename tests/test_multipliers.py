@@ -126,6 +126,21 @@ def test_both_signals_move_the_multiplier() -> None:
     assert penalty.multiplier.item() == 50.0
 
 
+def test_at_the_allowed_rate_the_signal_of_the_road_has_no_direction() -> None:
+    """Crashes at random in one of 40 episodes, half of the limit, for the worst half of the episodes holds them all."""
+    penalty = make_penalty(cost_limit=0.05, risk_level=0.5, episode_length=150, window=500, min_episodes=20, road_steps=2000)
+    rng = np.random.default_rng(0)
+    signals = []
+    for _ in range(1000):
+        crashes = rng.random(10) < 0.025
+        for step in range(150):
+            last = np.full(10, step == 149)
+            penalty.observe(crashes * last, last)
+        signals.append(penalty.update(0.0)["violation_road"])
+    assert np.mean(signals[20:]) == pytest.approx(0.0, abs=0.1)
+    assert min(signals) == pytest.approx(-1 / 3, abs=0.05) and max(signals[20:]) == 1.0
+
+
 def test_multiplier_stays_above_its_lower_bound() -> None:
     penalty = make_penalty(lambda_lr=0.1)
     calibrate(penalty, 0.0)

@@ -33,7 +33,9 @@ class CostReader:
         if self.cost_key not in info:
             self._warn_missing(info)
             return 0.0
-        cost = np.asarray(info[self.cost_key])
+        given = info[self.cost_key]
+        # NumPy refuses lists of uneven lists by a sentence of its own
+        cost = np.asarray(given, dtype=object if isinstance(given, list | tuple) else None)
         if cost.ndim > 0 or cost.dtype.kind not in "biuf" or not np.isfinite(cost) or cost < 0:
             self._refuse(info, "a cost must be one number from 0 to 1, or a bool")
         if np.float32(cost) > 1:

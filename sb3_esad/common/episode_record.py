@@ -128,6 +128,11 @@ class EpisodeRecord(nn.Module):
         """
         return self.recent["costs"] / max(self.recent["steps"], 1.0) * self.episode_length
 
+    @property
+    def resolution(self) -> float:
+        """Cost of an episode of usual length if a single cost of 1 had fallen into the latest steps."""
+        return self.episode_length / max(self.recent["steps"], 1.0)
+
     def tail_cost(self, risk_level: float) -> float:
         """
         Conditional value at risk of the episode cost at the present rate.

@@ -163,7 +163,9 @@ class AugmentedLagrangian(Penalty):
             signals["violation_model"] = violation / self.budget_scale
         if self.episodes.seen >= ENOUGH_ROAD:
             excess = self.episodes.tail_cost(self.risk_level) - self.cost_limit
-            signals["violation_road"] = excess / max(self.cost_limit, 0.02)
+            # Bounded below a single cost the signal would be a switch, and rest at twice the cost that is allowed
+            single = self.episodes.resolution / self.risk_level
+            signals["violation_road"] = excess / max(self.cost_limit, single, 0.02)
         return {name: min(max(signal, -1.0), 1.0) for name, signal in signals.items()}
 
     def _move(self, signals: list[float], gradient_steps: int) -> None:

@@ -10,6 +10,7 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
+from sb3_esad.common.checks import require
 from sb3_esad.common.decoders import ImageHead, ObservationHead, VectorHead
 from sb3_esad.common.extractors import grid_shape
 from sb3_esad.common.heads import PredictionHeads
@@ -33,6 +34,7 @@ class WorldModel(LearningModule):
     :param cost_weight: weight of a cost event in the loss of the cost head
     :param foreground_weight: additional weight of the pixels that differ from the background
     :param open_loop_length: longest stretch without observation that the model is trained to bridge, in steps
+    :raises ValueError: if a weight or the length is out of its range
     """
 
     def __init__(
@@ -47,6 +49,9 @@ class WorldModel(LearningModule):
         open_loop_length: int = 8,
     ) -> None:
         super().__init__()
+        require(cost_weight > 0, "cost_weight", cost_weight, "a weight > 0")
+        require(foreground_weight >= 0, "foreground_weight", foreground_weight, "a weight >= 0")
+        require(open_loop_length >= 1, "open_loop_length", open_loop_length, "a number of steps >= 1")
         self.observation_space = observation_space
         self.normalize_images = normalize_images
         self.open_loop_length = open_loop_length

@@ -77,6 +77,10 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         super()._check_arguments()
         uniform = self.uniform_action_prob
         require(0 <= uniform <= 1, "uniform_action_prob", uniform, "a probability in [0, 1]")
+        for name in ("replay_critic_coef", "replay_cost_critic_coef"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "a weight >= 0")
+        target, remedy = self.target_entropy, 'a number of nats, or "auto"'
+        require(target == "auto" or isinstance(target, int | float), "target_entropy", target, remedy)
 
     def _setup_model(self) -> None:
         super()._setup_model()
