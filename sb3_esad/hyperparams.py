@@ -2,6 +2,7 @@
 
 import difflib
 import inspect
+import re
 from inspect import Parameter
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -10,6 +11,7 @@ import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
+from sb3_esad.common.schedules import HoldThenFall
 
 RUN_KEYS = ("n_timesteps", "n_envs")
 """Keys of RL Zoo that concern the training and not the algorithm."""
@@ -48,6 +50,8 @@ def load_hyperparams(algorithm: type[BaseAlgorithm], name: str, env_id: str) -> 
         raise ValueError(f"{path} has neither an entry '{env_id}' nor a 'default'; add one of them.")
     arguments = {key: value for key, value in entry.items() if key not in RUN_KEYS}
     check_keys(algorithm, arguments, path)
+    if "learning_rate" in arguments:
+        arguments["learning_rate"] = read_rate(arguments["learning_rate"], path)
     return Hyperparams(int(entry.get("n_timesteps", 100_000)), int(entry.get("n_envs", 1)), arguments)
 
 
@@ -79,6 +83,23 @@ def read_entries(path: Path) -> dict[str, Any]:
     if not isinstance(entries, dict):
         raise ValueError(f"{path} holds no settings by environment id; see {hyperparams_folder() / 'esad_lend.yml'}.")
     return entries
+
+
+def read_rate(rate: Any, source: object) -> Any:
+    """
+    Understand a learning rate as RL Zoo does.
+
+    :param rate: a number, or ``"lin_x"`` for one that falls from x to 0 in a straight line
+    :param source: where it comes from, for the message
+    :return: the number, or the function of the remaining progress
+    :raises ValueError: if it is any other word
+    """
+    if not isinstance(rate, str):
+        return rate
+    linear = re.fullmatch(r"lin_(\d+(?:\.\d+)?(?:e-?\d+)?)", rate)
+    if linear is None:
+        raise ValueError(f"learning_rate in {source} is {rate!r}; choose a number such as 1.0e-3, or lin_0.001.")
+    return HoldThenFall(float(linear[1]), hold=0.0)
 
 
 def _names(folder: Path) -> list[str]:
