@@ -279,3 +279,16 @@ def test_learning_curve_of_few_episodes(tmp_path: Path, cost_limit: float | None
     assert (tmp_path / "curve.png").exists()
     with pytest.raises(ValueError, match="No training episode has ended"):
         plot_learning_curve(tmp_path / "none.png", [], cost_limit)
+
+
+def test_records_count_the_cost_that_was_asked_for() -> None:
+    class TwoCosts(CountingEnv):
+        def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
+            observation, reward, terminated, truncated, info = super().step(action)
+            return observation, reward, terminated, truncated, {**info, "bump": 0.5, "driving": {"cost": 68.0}}
+
+    env = SeededEpisodes(TwoCosts(episode_length=4), [0], cost_key="bump")
+    env.reset()
+    for _ in range(4):
+        env.step(env.action_space.sample())
+    assert [record["cost"] for record in env.records] == [2.0]
