@@ -49,10 +49,10 @@ def check_config(config: dict[str, Any]) -> None:
             raise ValueError(f"{name} is {frequency!r}; choose a whole number from 1 on")
     if physics % policy:
         raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
-    for name in POSITIVE & config.keys():
+    for name in sorted(POSITIVE & config.keys()):
         if not _is_positive(config[name]):
             raise ValueError(f"{name} is {config[name]!r}; choose a number above 0")
-    for name in POSITIVE_PAIRS & config.keys():
+    for name in sorted(POSITIVE_PAIRS & config.keys()):
         pair = config[name]
         if np.shape(pair) != (2,) or not all(map(_is_positive, pair)):
             raise ValueError(f"{name} is {pair!r}; choose two numbers above 0, along the road and across it")
