@@ -193,7 +193,7 @@ def test_targets_follow_slowly() -> None:
 
 
 def test_critics_do_not_learn_through_their_own_targets(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They bootstrap from themselves, and would otherwise move what is to come towards what they expect now."""
+    """Otherwise they would move what is to come towards what they expect now."""
     model = make_model().learn(24)
     learned: list[bool] = []
     for critic in (model.policy.critic, model.policy.cost_critic):
@@ -205,6 +205,31 @@ def test_critics_do_not_learn_through_their_own_targets(monkeypatch: pytest.Monk
         monkeypatch.setattr(critic, "loss", spy)
     model._update_behavior(*imagine(model))
     assert learned == [False] * 6
+
+
+def test_critics_bootstrap_from_their_averages(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever the networks that learn expect of what is to come, their targets do not depend on it."""
+    model = make_model().learn(24)
+    samples_and_states = imagine(model)
+    seen: list[list[th.Tensor]] = []
+    for offset in (0.0, 5.0):
+        learned: list[th.Tensor] = []
+        for critic in (model.policy.critic, model.policy.cost_critic):
+            with th.no_grad():
+                for parameter in critic.parameters():
+                    parameter += offset
+
+            def spy(grid: th.Tensor, action: th.Tensor, *targets: th.Tensor, loss: Any = type(critic).loss, of: Any = critic) -> Any:
+                learned.extend(target.clone() for target in targets)
+                return loss(of, grid, action, *targets)
+
+            monkeypatch.setattr(critic, "loss", spy)
+        th.manual_seed(0)
+        monkeypatch.setattr(model, "_step", lambda name, loss: 0.0)
+        model._update_behavior(*samples_and_states)
+        seen.append(learned)
+    for first, second in zip(*seen, strict=True):
+        th.testing.assert_close(first, second)
 
 
 class KnownCritic(th.nn.Module):

@@ -77,7 +77,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             "max_wheel_angle": 0.5,
             "max_lateral_acceleration": 4.0,
             "reward_weights": {"velocity": 0.7, "lane": 0.2, "orientation": 0.1, "exploration": 0.0},
-            "velocity_sharpness": 0.02,
+            "velocity_sharpness": 0.2,
             "orientation_sharpness": 5.0,
             "lane_tolerance": 2.0,
             "exploration_decay": 0.1,

@@ -102,10 +102,10 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         }
 
     def _update_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        critic = self.policy.critic
+        critic, target = self.policy.critic, self.policy.critic_target
         with th.no_grad():
-            targets = imagined_returns(critic, imagined, self.gamma, self.lambda_return)
-        recorded_targets = recorded_return_targets(critic, recorded, self.gamma)
+            targets = imagined_returns(target, imagined, self.gamma, self.lambda_return)
+        recorded_targets = recorded_return_targets(target, recorded, self.gamma)
         critic.follow_scale(targets)
         dreamed = (imagined.weights.flatten() * critic.loss(*taken(imagined), targets.flatten())).mean()
         anchored = (recorded.event_weights * critic.loss(recorded.grids, recorded.actions, recorded_targets)).mean()
@@ -119,12 +119,12 @@ class ESADLEND(ConstrainedLatentAlgorithm):
 
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
         continue_after_cost = self.replay_buffer.continue_after_cost
-        critic = self.policy.cost_critic
+        critic, target = self.policy.cost_critic, self.policy.cost_critic_target
         if continue_after_cost > 0:
-            for each in (critic, self.policy.cost_critic_target):
+            for each in (critic, target):
                 each.raise_bound(1 / (1 - self._cost_gamma))
-        targets = cost_targets(critic, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(critic, recorded, self._cost_gamma)
+        targets = cost_targets(target, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
+        anchors = recorded_cost_targets(target, recorded, self._cost_gamma)
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)

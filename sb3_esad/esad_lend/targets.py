@@ -1,8 +1,7 @@
 """
 What the critics of ESAD-LEND learn: targets from imagined trajectories and from recorded transitions.
 
-Critics bootstrap from themselves as they are: with a bootstrap from their slow averages driving was learned later
-(docs/experiments.md, section 7).
+Critics bootstrap from their slow averages, as in SAC.
 """
 
 from typing import NamedTuple
