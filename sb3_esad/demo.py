@@ -22,7 +22,7 @@ from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
 TIMESTEPS, MINUTES = 11_500, 7.0
-FEWER_UPDATES = {"train_freq": 4, "learning_rate": FALLING_RATE}
+FEWER_UPDATES = {"train_freq": 4, "lambda_lr": 0.04, "learning_rate": FALLING_RATE}
 """Steps are quicker than updates: in minutes one learns more from twice as many of them for each update."""
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
