@@ -22,6 +22,8 @@ from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
 TIMESTEPS, MINUTES = 6_500, 7.2
+FEW_UPDATES = {"learning_rate": FALLING_RATE, "lambda_lr": 0.04}
+"""In hundreds of updates a rate that falls from the start moves the networks too little, and the multiplier comes too late."""
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
@@ -64,8 +66,7 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESAD
     :return: the model, and a sentence about its training
     """
     hyperparams = load_hyperparams(ESADLEND, "esad_lend", ENV_ID)
-    # A rate that falls from the start would move the networks too little in so few updates
-    arguments = {**hyperparams.arguments, "learning_rate": FALLING_RATE}
+    arguments = {**hyperparams.arguments, **FEW_UPDATES}
     model = ESADLEND(env=make_vec_env(ENV_ID, hyperparams.n_envs), seed=seed, **arguments)
     history = EpisodeHistory()
     print(f"Training ESAD-LEND on {ENV_ID} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
