@@ -9,9 +9,9 @@ from typing import Any, NamedTuple
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
-from sb3_esad.common.schedules import HoldThenFall
 
 RUN_KEYS = ("n_timesteps", "n_envs")
 """Keys of RL Zoo that concern the training and not the algorithm."""
@@ -99,7 +99,7 @@ def read_rate(rate: Any, source: object) -> Any:
     linear = re.fullmatch(r"lin_(\d+(?:\.\d+)?(?:e-?\d+)?)", rate)
     if linear is None:
         raise ValueError(f"learning_rate in {source} is {rate!r}; choose a number such as 1.0e-3, or lin_0.001.")
-    return HoldThenFall(float(linear[1]), hold=0.0)
+    return LinearSchedule(float(linear[1]), end=0.0, end_fraction=1.0)
 
 
 def _names(folder: Path) -> list[str]:
