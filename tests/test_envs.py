@@ -377,10 +377,12 @@ def test_reward_terms_by_hand() -> None:
     assert rewards.progress_share(30.0, 25.0) == 1.0
 
 
-def test_every_metre_per_second_pays_at_every_speed() -> None:
+def test_every_metre_per_second_pays_more_than_the_one_before() -> None:
+    """By hand: at 20 of 25 m/s (1/2 - 1/6) / (1 - 1/6) with the scenario's 0.2 s/m."""
     sharpness = alone().config["velocity_sharpness"]
-    gains = np.diff([rewards.velocity_reward(float(speed), 25.0, sharpness) for speed in range(26)])
-    assert gains.min() > 0.005
+    pays = [rewards.velocity_reward(float(speed), 25.0, sharpness) for speed in range(26)]
+    assert pays[20] == pytest.approx(0.4) and (pays[0], pays[25]) == (0.0, 1.0)
+    assert (np.diff(pays) > 0).all() and (np.diff(pays, n=2) > 0).all()
 
 
 def test_parking_pays_nothing_and_exploration_wears_off() -> None:
