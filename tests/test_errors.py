@@ -109,7 +109,9 @@ def test_arguments_out_of_range(name: str, value: Any, remedy: str) -> None:
     check_sentence(error, f"{name} is {value!r}", "choose", remedy)
 
 
-@pytest.mark.parametrize(("name", "value"), [("cost_weight", 0.0), ("foreground_weight", -1.0), ("open_loop_length", 0)])
+@pytest.mark.parametrize(
+    ("name", "value"), [("cost_weight", 0.0), ("sparsity_weight", -0.1), ("foreground_weight", -1.0), ("open_loop_length", 0)]
+)
 def test_arguments_of_the_world_model_out_of_range(name: str, value: Any) -> None:
     with pytest.raises(ValueError) as error:
         make_model(policy_kwargs={**TINY["policy_kwargs"], "world_model_kwargs": {name: value}})

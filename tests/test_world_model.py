@@ -19,6 +19,7 @@ from sb3_esad.common.latents import Gaussian, GaussianHead, LatentHead
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.rssm import RSSM, Filtered
 from sb3_esad.common.starts import EVENT_HORIZON, SETTLING_STEPS, choose_starts
+from sb3_esad.common.torch_layers import SparseReadout
 from sb3_esad.common.type_aliases import NO_EVENT, LatentState, Predictions, SequenceSamples
 from sb3_esad.common.world_model import WorldModel
 from tests.conftest import CountingEnv
@@ -304,7 +305,7 @@ def test_learns_a_deterministic_world(kind: str) -> None:
 @pytest.mark.parametrize(("probability", "oversampled"), [(0.01, False), (0.05, False), (0.05, True)])
 def test_cost_head_is_calibrated(probability: float, oversampled: bool) -> None:
     """In spite of the weight on costs, and of windows drawn for their costs, it predicts how often there is one."""
-    heads = PredictionHeads((1, 1, 1), 8, cost_weight=10.0)
+    heads = PredictionHeads((1, 1, 1), 8, cost_weight=10.0, sparsity_weight=0.03)
     n = 1000
     costs = (th.arange(n) < probability * n).float()
     weights = th.ones(n)
@@ -324,7 +325,7 @@ def test_cost_head_is_calibrated(probability: float, oversampled: bool) -> None:
 
 
 def test_weights_leave_the_reward_alone() -> None:
-    heads = PredictionHeads((1, 1, 1), 8, cost_weight=10.0)
+    heads = PredictionHeads((1, 1, 1), 8, cost_weight=10.0, sparsity_weight=0.03)
     grid, ones = th.randn(6, 1, 1, 1), th.ones(6)
     targets = Predictions(ones, ones, ones)
     _, once = heads.loss(grid, targets, ones)
@@ -332,6 +333,46 @@ def test_weights_leave_the_reward_alone() -> None:
     assert twice["reward_loss"] == pytest.approx(once["reward_loss"])
     assert twice["cost_loss"] == pytest.approx(2 * once["cost_loss"])
     assert twice["continue_loss"] == pytest.approx(2 * once["continue_loss"])
+
+
+def rare_events(n: int, generator: th.Generator) -> tuple[th.Tensor, th.Tensor]:
+    """Grids of noise on 4x4 cells, and whether the first number of one of the cells is high."""
+    grids = th.randn(n, 8, 4, 4, generator=generator)
+    return grids, (grids[:, 0, 2, 1] > 1.5).float()
+
+
+def separation(sparsity_weight: float) -> float:
+    """How well heads that have seen 20 events tell new ones: the area under the curve."""
+    th.manual_seed(0)
+    generator = th.Generator().manual_seed(1)
+    heads = PredictionHeads((8, 4, 4), 32, cost_weight=10.0, sparsity_weight=sparsity_weight)
+    grids, costs = rare_events(300, generator)
+    targets, optimizer = Predictions(th.zeros(300), costs, 1 - costs), th.optim.Adam(heads.parameters(), lr=0.01)
+    for _ in range(200):
+        loss, _ = heads.loss(grids, targets, th.ones(300))
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+    fresh, labels = rare_events(4000, generator)
+    scores = heads(fresh).costs.detach()
+    events, others = scores[labels > 0], scores[labels == 0]
+    return (events[:, None] > others).float().mean().item()
+
+
+def test_rare_events_are_understood_instead_of_learned_by_heart() -> None:
+    """Twenty events tell which cell matters, if looking at a cell has its price."""
+    assert separation(sparsity_weight=0.03) > 0.95
+    assert separation(sparsity_weight=0.0) < 0.9
+
+
+def test_every_cell_has_its_price() -> None:
+    readout = SparseReadout((1, 2, 2), 2)
+    weight = th.zeros(2, 4)  # a row for each number of the summary, a column for each cell
+    weight[:, 1] = th.tensor([3.0, 4.0])
+    weight[0, 2] = -2.0
+    readout.mix.weight.data = weight
+    assert readout.price().item() == pytest.approx(5.0 + 2.0)
+    assert SparseReadout((8, 1, 1), 2).price().item() == 0.0
 
 
 def test_value_distribution_starts_at_zero_and_fits_numbers() -> None:

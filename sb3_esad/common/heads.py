@@ -5,7 +5,7 @@ from torch import nn
 from torch.nn.functional import binary_cross_entropy_with_logits
 
 from sb3_esad.common.functional import correct_logit
-from sb3_esad.common.torch_layers import GridReadout, GridShape, mlp
+from sb3_esad.common.torch_layers import GridReadout, GridShape, SparseReadout, mlp
 from sb3_esad.common.transforms import symexp, twohot_decode, twohot_encode
 from sb3_esad.common.type_aliases import Logs, Predictions
 
@@ -52,16 +52,19 @@ class PredictionHeads(nn.Module):
     :param grid_shape: shape of the latent grid (C, H, W)
     :param units: units of the hidden layers
     :param cost_weight: weight of a cost event in the binary cross-entropy, undone in the predicted probability
+    :param sparsity_weight: price of looking at a cell, of those that foretell cost and end
     """
 
-    def __init__(self, grid_shape: GridShape, units: int, cost_weight: float) -> None:
+    def __init__(self, grid_shape: GridShape, units: int, cost_weight: float, sparsity_weight: float) -> None:
         super().__init__()
         self.cost_weight = cost_weight
+        self.sparsity_weight = sparsity_weight
         self.distribution = ValueDistribution()
         self.readout = GridReadout(grid_shape, units)
         self.reward = mlp(units, [units], self.distribution.n_bins, zero_output=True)
-        self.cost = mlp(units, [units], 1)
-        self.going_on = mlp(units, [units], 1)
+        self.event_readout = SparseReadout(grid_shape, units)
+        self.cost = nn.Linear(units, 1)
+        self.going_on = nn.Linear(units, 1)
 
     def forward(self, grid: th.Tensor) -> Predictions:
         """
@@ -92,10 +95,11 @@ class PredictionHeads(nn.Module):
             "continue_loss": (
                 event_weights * binary_cross_entropy_with_logits(going_on, targets.continues, reduction="none")
             ).mean(),
+            "sparsity_loss": self.sparsity_weight * self.event_readout.price(),
         }
         return th.stack(list(terms.values())).sum(), {name: term.item() for name, term in terms.items()}
 
     def _logits(self, grid: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
-        features = self.readout(grid)
-        reward, cost, going_on = self.reward(features), self.cost(features), self.going_on(features)
+        events = self.event_readout(grid)
+        reward, cost, going_on = self.reward(self.readout(grid)), self.cost(events), self.going_on(events)
         return reward, cost.float().squeeze(-1), going_on.float().squeeze(-1)

@@ -123,6 +123,48 @@ class GridReadout(nn.Module):
         return self.mix(self.cells(grid))
 
 
+class SparseReadout(nn.Module):
+    """
+    Summarise those few cells of a grid that matter.
+
+    Dozens of rare events differ in whatever stands anywhere: a readout that is free to look everywhere learns them by heart
+    (docs/experiments.md, section 10). Here each cell has its price: the norm of the weights that look at it (group lasso, Yuan
+    & Lin 2006), so that a cell which does not tell the events apart is left out.
+
+    :param shape: shape of the grid (C, H, W)
+    :param features_dim: length of the summary
+    :param flat_features: how many numbers the cells may hold together before they are mixed
+    """
+
+    def __init__(self, shape: GridShape, features_dim: int, flat_features: int = 512) -> None:
+        super().__init__()
+        channels, height, width = shape
+        self.n_cells = height * width
+        cell_features = max(1, min(channels, flat_features // self.n_cells))
+        self.cells = nn.Sequential(same_conv(channels, cell_features, 1), ChannelNorm(cell_features))
+        # Not normalised once it is mixed, for that would give back what small weights take away
+        self.mix = nn.Linear(cell_features * self.n_cells, features_dim)
+
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Summarise grids.
+
+        :param grid: features, of shape (N, C, H, W)
+        :return: summaries, of shape (N, features_dim)
+        """
+        return nn.functional.silu(self.mix(self.cells(grid).flatten(1)))
+
+    def price(self) -> th.Tensor:
+        """
+        Add up the prices of the cells.
+
+        :return: scalar; 0 for a single cell, which leaves nothing to choose
+        """
+        if self.n_cells == 1:
+            return self.mix.weight.new_zeros(())
+        return self.mix.weight.unflatten(1, (-1, self.n_cells)).norm(dim=(0, 1)).sum()
+
+
 def join(tensors: Sequence[th.Tensor]) -> th.Tensor:
     """
     Stack along a new first dimension, keeping channels last in memory, which ``th.stack`` would not.

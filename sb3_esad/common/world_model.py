@@ -32,6 +32,7 @@ class WorldModel(LearningModule):
     :param normalize_images: whether images are bytes to be divided by 255
     :param units: units of the heads' hidden layers
     :param cost_weight: weight of a cost event in the loss of the cost head
+    :param sparsity_weight: price of each cell that the heads of cost and end look at
     :param foreground_weight: additional weight of the pixels that differ from the background
     :param open_loop_length: longest stretch without observation that the model is trained to bridge, in steps
     :raises ValueError: if a weight or the length is out of its range
@@ -45,11 +46,13 @@ class WorldModel(LearningModule):
         normalize_images: bool = True,
         units: int = 256,
         cost_weight: float = 10.0,
+        sparsity_weight: float = 0.03,
         foreground_weight: float = 10.0,
         open_loop_length: int = 8,
     ) -> None:
         super().__init__()
         require(cost_weight > 0, "cost_weight", cost_weight, "a weight > 0")
+        require(sparsity_weight >= 0, "sparsity_weight", sparsity_weight, "a weight >= 0")
         require(foreground_weight >= 0, "foreground_weight", foreground_weight, "a weight >= 0")
         require(open_loop_length >= 1, "open_loop_length", open_loop_length, "a number of steps >= 1")
         self.observation_space = observation_space
@@ -60,7 +63,7 @@ class WorldModel(LearningModule):
         self.rssm = rssm
         channels = rssm.memory_shape[0] + rssm.latent_shape[0]
         grid = (channels, *rssm.memory_shape[1:])
-        self.predictions = PredictionHeads(grid, units, cost_weight)
+        self.predictions = PredictionHeads(grid, units, cost_weight, sparsity_weight)
         self.observations = nn.ModuleDict(
             {key: self._make_head(space, grid, foreground_weight) for key, space in _spaces_by_key(observation_space).items()}
         )
