@@ -19,7 +19,7 @@ from sb3_esad.common.latents import Gaussian, GaussianHead, LatentHead
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.rssm import RSSM, Filtered
 from sb3_esad.common.starts import EVENT_HORIZON, SETTLING_STEPS, choose_starts
-from sb3_esad.common.torch_layers import SparseReadout
+from sb3_esad.common.torch_layers import GridReadout, SparseReadout
 from sb3_esad.common.type_aliases import NO_EVENT, LatentState, Predictions, SequenceSamples
 from sb3_esad.common.world_model import WorldModel
 from tests.conftest import CountingEnv
@@ -372,7 +372,7 @@ def test_every_cell_has_its_price() -> None:
     weight[0, 2] = -2.0
     readout.mix.weight.data = weight
     assert readout.price().item() == pytest.approx(5.0 + 2.0)
-    assert SparseReadout((8, 1, 1), 2).price().item() == 0.0
+    assert GridReadout((8, 2, 2), 2).price().item() == 0.0
 
 
 def test_value_distribution_starts_at_zero_and_fits_numbers() -> None:

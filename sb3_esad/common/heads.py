@@ -62,9 +62,12 @@ class PredictionHeads(nn.Module):
         self.distribution = ValueDistribution()
         self.readout = GridReadout(grid_shape, units)
         self.reward = mlp(units, [units], self.distribution.n_bins, zero_output=True)
-        self.event_readout = SparseReadout(grid_shape, units)
-        self.cost = nn.Linear(units, 1)
-        self.going_on = nn.Linear(units, 1)
+        # A single cell leaves nothing to choose
+        spatial = grid_shape[1] * grid_shape[2] > 1
+        self.event_readout = SparseReadout(grid_shape, units) if spatial else GridReadout(grid_shape, units)
+        hidden = [] if spatial else [units]
+        self.cost = mlp(units, hidden, 1)
+        self.going_on = mlp(units, hidden, 1)
 
     def forward(self, grid: th.Tensor) -> Predictions:
         """

@@ -122,6 +122,14 @@ class GridReadout(nn.Module):
         """
         return self.mix(self.cells(grid))
 
+    def price(self) -> th.Tensor:
+        """
+        Tell what looking at the cells costs, beside :class:`SparseReadout`.
+
+        :return: nothing
+        """
+        return next(self.parameters()).new_zeros(())
+
 
 class SparseReadout(nn.Module):
     """
@@ -158,10 +166,8 @@ class SparseReadout(nn.Module):
         """
         Add up the prices of the cells.
 
-        :return: scalar; 0 for a single cell, which leaves nothing to choose
+        :return: scalar
         """
-        if self.n_cells == 1:
-            return self.mix.weight.new_zeros(())
         return self.mix.weight.unflatten(1, (-1, self.n_cells)).norm(dim=(0, 1)).sum()
 
 

@@ -32,7 +32,7 @@ class WorldModel(LearningModule):
     :param normalize_images: whether images are bytes to be divided by 255
     :param units: units of the heads' hidden layers
     :param cost_weight: weight of a cost event in the loss of the cost head
-    :param sparsity_weight: price of each cell that the heads of cost and end look at
+    :param sparsity_weight: price of each cell of a grid that the heads of cost and end look at
     :param foreground_weight: additional weight of the pixels that differ from the background
     :param open_loop_length: longest stretch without observation that the model is trained to bridge, in steps
     :raises ValueError: if a weight or the length is out of its range
