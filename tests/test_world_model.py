@@ -370,7 +370,7 @@ def test_every_cell_has_its_price() -> None:
     weight = th.zeros(2, 4)  # a row for each number of the summary, a column for each cell
     weight[:, 1] = th.tensor([3.0, 4.0])
     weight[0, 2] = -2.0
-    readout.mix.weight.data = weight
+    next(readout.mix.parameters()).data = weight
     assert readout.price().item() == pytest.approx(5.0 + 2.0)
     assert GridReadout((8, 2, 2), 2).price().item() == 0.0
 

@@ -124,14 +124,14 @@ class GridReadout(nn.Module):
 
     def price(self) -> th.Tensor:
         """
-        Tell what looking at the cells costs, beside :class:`SparseReadout`.
+        Price of looking at the cells.
 
-        :return: nothing
+        :return: 0
         """
         return next(self.parameters()).new_zeros(())
 
 
-class SparseReadout(nn.Module):
+class SparseReadout(GridReadout):
     """
     Summarise those few cells of a grid that matter.
 
@@ -145,22 +145,12 @@ class SparseReadout(nn.Module):
     """
 
     def __init__(self, shape: GridShape, features_dim: int, flat_features: int = 512) -> None:
-        super().__init__()
-        channels, height, width = shape
-        self.n_cells = height * width
-        cell_features = max(1, min(channels, flat_features // self.n_cells))
-        self.cells = nn.Sequential(same_conv(channels, cell_features, 1), ChannelNorm(cell_features))
+        super().__init__(shape, features_dim, flat_features)
+        flatten, linear, _, activation = self.mix
+        self.cells[1] = ChannelNorm(self.cells[0].out_channels)
         # Not normalised once it is mixed, for that would give back what small weights take away
-        self.mix = nn.Linear(cell_features * self.n_cells, features_dim)
-
-    def forward(self, grid: th.Tensor) -> th.Tensor:
-        """
-        Summarise grids.
-
-        :param grid: features, of shape (N, C, H, W)
-        :return: summaries, of shape (N, features_dim)
-        """
-        return nn.functional.silu(self.mix(self.cells(grid).flatten(1)))
+        self.mix = nn.Sequential(flatten, linear, activation)
+        self.n_cells = shape[1] * shape[2]
 
     def price(self) -> th.Tensor:
         """
@@ -168,7 +158,8 @@ class SparseReadout(nn.Module):
 
         :return: scalar
         """
-        return self.mix.weight.unflatten(1, (-1, self.n_cells)).norm(dim=(0, 1)).sum()
+        weight, _ = self.mix.parameters()
+        return th.linalg.vector_norm(weight.unflatten(1, (-1, self.n_cells)), dim=(0, 1)).sum()
 
 
 def join(tensors: Sequence[th.Tensor]) -> th.Tensor:
