@@ -1,38 +1,38 @@
 # Each target sets up what it needs in a local environment; only Python itself must be there.
 PYTHON ?= python3
 BIN := .venv/bin
-INSTALLED := .venv/.installed
 TOO_OLD := "sb3_esad needs Python 3.10 or newer, $(PYTHON) is %d.%d; choose another with make PYTHON=python3.11"
 
 .PHONY: demo test lint type format benchmark
 
 # Train briefly, evaluate and print the metrics.
-demo: $(INSTALLED)
+demo: .venv/.demo
 	$(BIN)/python -m sb3_esad demo
 
 # Two workers, for the tests are many and small; tests/conftest.py gives each of them one thread.
-test: $(INSTALLED)
+test: .venv/.tests
 	$(BIN)/python -m pytest -n 2
 
-lint: $(INSTALLED)
+lint: .venv/.tests
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 
-type: $(INSTALLED)
+type: .venv/.tests
 	$(BIN)/mypy
 
-format: $(INSTALLED)
+format: .venv/.tests
 	$(BIN)/ruff check --fix .
 	$(BIN)/ruff format .
 
 # What a step, an update and a decision take, as ratios within one run.
-benchmark: $(INSTALLED)
+benchmark: .venv/.tests
 	$(BIN)/python benchmark/scenario_speed.py
 	$(BIN)/python benchmark/update_speed.py
 	$(BIN)/python benchmark/predict_latency.py
 
-$(INSTALLED): setup.cfg constraints.txt
+# The demo has ten minutes in all and needs no tools; each stamp is named after the extras that it stands for.
+.venv/.demo .venv/.tests: setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[demo,tests]"
+	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(@:.venv/.%=%)]"
 	@touch $@

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
-import numpy as np
 import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
@@ -22,7 +21,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad import ESADLEND
 from sb3_esad.driving_evaluation import evaluate_model
-from sb3_esad.envs.metrics import Record
+from sb3_esad.envs.metrics import summarise
 from sb3_esad.hyperparams import load_hyperparams
 
 ENV = "esad-highway-v0"
@@ -81,27 +80,6 @@ def sac(seed: int, changes: dict[str, Any]) -> SAC:
 ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {"esad_lend": esad_lend, "sac": sac}
 
 
-def summary(records: list[Record]) -> dict[str, float]:
-    """
-    Average what the tables need.
-
-    :param records: of the episodes
-    :return: driving score, route completion and collision-free share in %, speed in m/s, return, cost
-    """
-
-    def mean(key: str) -> float:
-        return float(np.mean([record[key] for record in records]))
-
-    return {
-        "DS": 100 * mean("driving_score"),
-        "RC": 100 * mean("route_completion"),
-        "collision_free": 100 * float(np.mean([record["collisions"] == 0 for record in records])),
-        "speed": mean("mean_speed"),
-        "return": mean("return"),
-        "cost": mean("cost"),
-    }
-
-
 class LearningCurve(BaseCallback):
     """
     Drives unseen episodes every ``every`` steps.
@@ -116,10 +94,12 @@ class LearningCurve(BaseCallback):
         self.path, self.every, self.seeds = path, every, seeds
 
     def _on_training_start(self) -> None:
-        self._next, self._seconds, self._resumed, self._cost = self.every, 0.0, time.monotonic(), 0.0
+        self._next, self._seconds, self._resumed = self.every, 0.0, time.monotonic()
+        self._cost, self._episodes = 0.0, 0
 
     def _on_step(self) -> bool:
         self._cost += sum(info["cost"] for info in self.locals["infos"])
+        self._episodes += int(self.locals["dones"].sum())
         if self.num_timesteps >= self._next:
             self._next += self.every
             self._seconds += time.monotonic() - self._resumed
@@ -128,9 +108,10 @@ class LearningCurve(BaseCallback):
         return True
 
     def _evaluate(self) -> None:
-        line = {"steps": self.num_timesteps, "seconds": round(self._seconds), "training_cost": self._cost}
+        line = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
+        line |= {"training_cost": self._cost, "training_episodes": self._episodes}
         for name, deterministic in (("best", True), ("sampled", False)):
-            line[name] = summary(evaluate_model(self.model, ENV, self.seeds, deterministic))
+            line[name] = summarise(evaluate_model(self.model, ENV, self.seeds, deterministic))
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
         self.model.save(self.path.with_suffix(".zip"))

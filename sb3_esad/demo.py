@@ -99,7 +99,7 @@ def write_results(path: Path, columns: Mapping[str, Figures], training: str, see
         "",
         format_table(columns),
         "",
-        "In brackets: 95 % intervals, Wilson's for shares and Student's t for means.",
+        "In brackets: 95 % intervals, Wilson's for shares, Poisson's for events per distance, Student's t for means.",
         "",
         f"Python {platform.python_version()}, {versions}; {os.cpu_count()} processors, {th.get_num_threads()} threads.",
     ]

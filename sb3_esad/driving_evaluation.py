@@ -94,7 +94,7 @@ def evaluate_model(
 
     Environment k plays every ``n_envs``-th seed from the k-th on; that short episodes end first makes no difference.
 
-    :param model: recurrent or not
+    :param model: recurrent or not; observations are normalised as its ``VecNormalize`` does, if its environment is one
     :param env_id: environment
     :param seeds: of the episodes
     :param deterministic: take the best action, not a sampled one
@@ -110,9 +110,11 @@ def evaluate_model(
     envs: list[Any] = dummy_env.envs
     vec_env = BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False)
     check_spaces(model, vec_env, env_id)
+    normalization = model.get_vec_normalize_env()
     observations, state, starts = vec_env.reset(), None, np.ones(n_envs, dtype=bool)
     while not all(env.finished for env in envs):
-        actions, state = model.predict(observations, state, starts, deterministic)  # type: ignore[arg-type]
+        seen = normalization.normalize_obs(observations) if normalization else observations  # type: ignore[arg-type]
+        actions, state = model.predict(seen, state, starts, deterministic)  # type: ignore[arg-type]
         observations, _, starts, _ = vec_env.step(actions)
     vec_env.close()
     return [envs[index % n_envs].records[index // n_envs] for index in range(len(seeds))]

@@ -32,13 +32,12 @@ def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, determinis
     :param deterministic: take the best action, not a sampled one
     :raises ValueError: if the environment is no driving scenario with an image, or not one that the model knows
     """
-    env = _make(env_id)
-    check_spaces(model, env, env_id)
-    if _image_of(env.observation_space.sample()) is None:
-        raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
-    write_video(
-        path, _drive_dreaming(env, DreamingDriver(model, deterministic=deterministic), seed), env.metadata["render_fps"]
-    )
+    with closing(_make(env_id)) as env:
+        check_spaces(model, env, env_id)
+        if _image_of(env.observation_space.sample()) is None:
+            raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
+        driver = DreamingDriver(model, deterministic=deterministic)
+        write_video(path, _drive_dreaming(env, driver, seed), env.metadata["render_fps"])
 
 
 def record_driver(path: Path, name: str, env_id: str, seed: int) -> None:
@@ -51,8 +50,8 @@ def record_driver(path: Path, name: str, env_id: str, seed: int) -> None:
     :param seed: of the episode
     :raises ValueError: if the environment is no driving scenario
     """
-    env = _make(env_id)
-    write_video(path, _drive(env, name, seed), env.metadata["render_fps"])
+    with closing(_make(env_id)) as env:
+        write_video(path, _drive(env, name, seed), env.metadata["render_fps"])
 
 
 def write_video(path: Path, frames: Iterable[Picture], fps: int) -> None:
@@ -84,8 +83,8 @@ def write_video(path: Path, frames: Iterable[Picture], fps: int) -> None:
 
 
 def _make(env_id: str) -> gym.Env[Any, Any]:
-    env = gym.make(env_id)
-    check_scenario(env, env_id)
+    with closing(gym.make(env_id)) as env:  # others may not know the mode, and their sentence would not help
+        check_scenario(env, env_id)
     return gym.make(env_id, render_mode="rgb_array")
 
 

@@ -19,6 +19,7 @@ from stable_baselines3.common.vec_env import SubprocVecEnv
 
 import sb3_esad.envs
 from sb3_esad.envs import rewards
+from sb3_esad.envs.config import RULES
 from sb3_esad.envs.drivers import CarFollower, RandomDriver, ReferenceDriver, SpeedKeeper
 from sb3_esad.envs.geometry import box_corners, boxes_overlap
 from sb3_esad.envs.highway import Highway
@@ -180,6 +181,13 @@ def test_traffic_does_not_crash_into_itself_and_merges() -> None:
         ({"policy_frequency": -5}, "policy_frequency is -5; choose"),
         ({"policy_frequency": 2.5}, r"policy_frequency is 2\.5; choose"),
         ({"policy_frequency": "5"}, "policy_frequency is '5'; choose"),
+        ({"headway": (-1.0, -0.5)}, r"headway is \(-1\.0, -0\.5\); choose two numbers from 0 on, the smaller one first"),
+        ({"desired_speed": (25.0, 21.5)}, r"desired_speed is \(25\.0, 21\.5\); choose two numbers"),
+        ({"lane_counts": 3}, "lane_counts is 3; choose a sequence of whole numbers from 1 on"),
+        ({"lane_counts": ()}, r"lane_counts is \(\); choose"),
+        ({"slow_share": 1.2}, r"slow_share is 1\.2; choose a share from 0 to 1"),
+        ({"merging_cars": -1}, "merging_cars is -1; choose a whole number from 0 on"),
+        ({"traffic_ahead": float("inf")}, "traffic_ahead is inf; choose a number from 0 on"),
         (
             {"reward_weights": 0.5},
             r"reward_weights is 0\.5; give a dictionary with some of the keys velocity, lane, orientation, exploration",
@@ -189,6 +197,23 @@ def test_traffic_does_not_crash_into_itself_and_merges() -> None:
 def test_wrong_configurations_are_named(config: dict[str, Any], message: str) -> None:
     with pytest.raises(ValueError, match=message):
         make(config=config)
+
+
+def test_every_setting_is_checked() -> None:
+    """A key that no rule knows would be taken as it comes."""
+    checked = {name for rule in RULES for name in rule.names}
+    others = {"reward_weights", "graded_cost", "frame"}
+    assert Highway.default_config().keys() == checked | others
+
+
+def test_pictures_come_as_often_as_decisions(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = Highway({"policy_frequency": 10}, render_mode="human")
+    assert env.metadata["render_fps"] == 10 and Highway.metadata["render_fps"] == 5
+    shown = []
+    monkeypatch.setattr(env, "render", lambda: shown.append(env.episode.steps))
+    env.reset(seed=0)
+    env.step(np.zeros(2, dtype=np.float32))
+    assert shown == [0, 1]
 
 
 def test_wrong_arguments_are_named() -> None:

@@ -96,6 +96,7 @@ def test_missing_costs_are_zero_with_one_warning() -> None:
         ("lambda_lr", -0.1, ">= 0"),
         ("penalty_coef", -0.1, ">= 0"),
         ("lagrangian_multiplier_init", 60.0, "within 0.05 and 50"),
+        ("lagrangian_multiplier_init", -1.0, "within 0.0 and 50"),
         ("ent_coef", -0.1, '"auto"'),
         ("ent_coef", "automatic", '"auto"'),
         ("sequence_length", 0, "from 1 to 1000"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
-from gymnasium.envs.registration import EnvSpec
+from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
@@ -348,9 +348,7 @@ def test_limits_choose_their_penalty() -> None:
 
 
 def test_budget_knows_the_time_limit() -> None:
-    env = CountingEnv()
-    env.spec = EnvSpec("limited-v0", max_episode_steps=40)
-    model = make_model(env, cost_limit=0.05, cost_gamma=0.95)
+    model = make_model(TimeLimit(CountingEnv(), 40), cost_limit=0.05, cost_gamma=0.95)
     assert model.penalty.budget == pytest.approx(0.0218, abs=1e-4)
 
 

@@ -11,6 +11,7 @@ import pytest
 import torch as th
 from conftest import CountingEnv
 from stable_baselines3 import SAC
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.type_aliases import LatentState
@@ -48,6 +49,9 @@ class Recorder:
     """Counts the steps of each environment's episode in its memory, and checks them with the observation."""
 
     observation_space, action_space = SeedEnv.observation_space, SeedEnv.action_space
+
+    def get_vec_normalize_env(self) -> None:
+        return None
 
     def predict(self, observation: Any, state: Any, episode_start: Any, deterministic: bool) -> tuple[Any, Any]:
         previous = np.full(len(observation), -1) if state is None else state[0]
@@ -102,6 +106,18 @@ def test_evaluate_model_in_all_observations(policy: str) -> None:
 def test_other_models_are_evaluated_too() -> None:
     model = SAC("MlpPolicy", SeedEnv(), policy_kwargs={"net_arch": [4]}, buffer_size=10)
     assert [record["steps"] for record in evaluate_model(model, "SeedEnv-v0", [3, 4])] == [4, 5]
+
+
+def test_what_was_learned_normalised_is_evaluated_normalised(monkeypatch: pytest.MonkeyPatch) -> None:
+    env = VecNormalize(DummyVecEnv([lambda: CountingEnv()]))
+    env.obs_rms.mean, env.obs_rms.var = np.array([3000.0]), np.array([4.0])
+    model = SAC("MlpPolicy", env, policy_kwargs={"net_arch": [4]}, buffer_size=10)
+    seen = []
+    monkeypatch.setattr(
+        model, "predict", lambda observation, *_: (seen.append(observation.item()), (np.zeros((1, 1)), None))[1]
+    )
+    evaluate_model(model, "SeedEnv-v0", [3])
+    assert seen == pytest.approx([0.0, 0.5, 1.0, 1.5], abs=1e-6)
 
 
 def test_evaluate_model_refuses_another_environment(model: ESADLEND) -> None:

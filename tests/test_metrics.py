@@ -13,6 +13,7 @@ from sb3_esad.envs.metrics import (
     DrivingMetrics,
     Episode,
     mean_interval,
+    poisson_interval,
     summarise,
     wilson_interval,
     worst_mean,
@@ -98,6 +99,8 @@ def test_summary_by_hand() -> None:
     assert figures["cost"] == pytest.approx(4 / 3)
     assert figures["cost_cvar"] == 3.0
     assert figures["DS_low"] < figures["DS"] < figures["DS_high"]
+    assert (figures["CR_low"], figures["CR_high"]) == pytest.approx((0.2422 / 0.2, 7.2247 / 0.2), abs=1e-2)
+    assert figures["CO_high"] == pytest.approx(figures["CR_high"] / 10)
 
 
 def test_no_records_is_an_error() -> None:
@@ -117,6 +120,12 @@ def test_mean_interval_by_hand() -> None:
     low, high = mean_interval(np.array([1.0, 2.0, 3.0]))
     assert (low, high) == pytest.approx((2 - 4.3027 / math.sqrt(3), 2 + 4.3027 / math.sqrt(3)), abs=1e-3)
     assert mean_interval(np.array([7.0])) == (7.0, 7.0)
+
+
+def test_poisson_interval_by_hand() -> None:
+    """Garwood's table: 3 / n for none of n, and (4.80, 18.39) for 10."""
+    assert poisson_interval(0) == pytest.approx((0.0, 3.689), abs=1e-3)
+    assert poisson_interval(10) == pytest.approx((4.795, 18.390), abs=1e-3)
 
 
 def test_worst_mean_by_hand() -> None:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from gymnasium.wrappers import TransformReward
 from stable_baselines3.common.callbacks import CheckpointCallback, EvalCallback, StopTrainingOnMaxEpisodes
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.envs import FakeImageEnv, IdentityEnvBox, SimpleMultiObsEnv
@@ -44,6 +45,18 @@ def test_processes(policy: str) -> None:
     model = learn(policy, env, steps=40)
     costs = model.replay_buffer.costs[: model.replay_buffer.size()]
     assert 0 < costs.mean() < 0.5
+    env.close()
+
+
+def test_processes_whose_environments_cannot_be_described() -> None:
+    """The spec of such an environment does not go through a pipe, and its process would die of the attempt."""
+
+    def make_env() -> gym.Env:
+        env = gym.make("Pendulum-v1", max_episode_steps=40)
+        return TransformReward(env, lambda reward: 0.1 * reward)
+
+    env = SubprocVecEnv([make_env] * 2)
+    assert ESADLEND("MlpPolicy", env, **TINY)._episode_length() == 40
     env.close()
 
 

@@ -2,12 +2,15 @@
 
 import io
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3 import SAC
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import load_from_zip_file
 from stable_baselines3.common.vec_env import DummyVecEnv
 
@@ -134,6 +137,13 @@ def test_arguments_that_do_not_fit_the_saved_networks(arguments: dict[str, Any],
         ESADLEND.load(tmp_path / "model", device="cpu", **arguments)
 
 
+def test_the_reason_is_the_first_error(tmp_path: Path) -> None:
+    """SB3 takes a ValueError for an old version's, and stumbles."""
+    train(ent_coef="auto_0.5").save(tmp_path / "model")
+    with pytest.raises(ValueError, match="entropy"):
+        ESADLEND.load(tmp_path / "model", device="cpu", ent_coef=0.1)
+
+
 def test_file_objects_need_not_be_rewound() -> None:
     file = io.BytesIO()
     train().save(file)
@@ -248,6 +258,31 @@ def test_replay_buffer(policy: str, n_envs: int, tmp_path: Path) -> None:
         assert_same(one, another)
     other.learn(32, reset_num_timesteps=False)
     assert other.replay_buffer.size() == 2 * 32 // n_envs
+
+
+def test_a_replay_buffer_takes_the_settings_of_its_model(tmp_path: Path) -> None:
+    train(sequence_length=4).save_replay_buffer(tmp_path / "buffer")
+    model = ESADLEND("MlpPolicy", make_env("MlpPolicy"), **{**TINY, "sequence_length": 6, "cost_key": "crashed"})
+    model.load_replay_buffer(tmp_path / "buffer")
+    assert model._sample(2).rewards.shape == (2, 6)
+    assert model.replay_buffer.read_costs.cost_key == "crashed"
+
+
+@pytest.mark.parametrize(
+    ("other", "named"),
+    [
+        (lambda: train(n_envs=2), "SequenceReplayBuffer of 2 environments"),
+        (lambda: train("CnnPolicy"), r"observations Box\(0, 255"),
+        (lambda: SAC("MlpPolicy", make_env("MlpPolicy"), buffer_size=10), "is a ReplayBuffer of 1 environments"),
+    ],
+)
+def test_a_foreign_replay_buffer_is_refused(other: Callable[[], OffPolicyAlgorithm], named: str, tmp_path: Path) -> None:
+    other().save_replay_buffer(tmp_path / "buffer")
+    model = train()
+    own = model.replay_buffer
+    with pytest.raises(ValueError, match=f"{named}.*but the model needs a SequenceReplayBuffer of 1 environments.*; load"):
+        model.load_replay_buffer(tmp_path / "buffer")
+    assert model.replay_buffer is own
 
 
 def test_a_saved_image_buffer_is_no_larger_than_its_frames(tmp_path: Path) -> None:

@@ -188,6 +188,26 @@ class SequenceReplayBuffer(ReplayBuffer):
         return self.to_torch(observations, copy=False)
 
 
+def refuse_other_buffer(loaded: ReplayBuffer, own: SequenceReplayBuffer) -> None:
+    """
+    Refuse a replay buffer that cannot take the place of another.
+
+    :param loaded: the buffer
+    :param own: the one whose place it shall take
+    :raises ValueError: if it is of another kind, or holds steps of other environments
+    """
+
+    def describe(buffer: ReplayBuffer) -> tuple[str, int, object, object]:
+        return type(buffer).__name__, buffer.n_envs, buffer.observation_space, buffer.action_space
+
+    if describe(loaded) != describe(own):
+        named = [
+            f"a {kind} of {n} environments, observations {seen} and actions {done}"
+            for kind, n, seen, done in map(describe, (loaded, own))
+        ]
+        raise ValueError(f"The replay buffer is {named[0]}, but the model needs {named[1]}; load the one that belongs to it.")
+
+
 def _check(buffer_size: int, sequence_length: int, optimize_memory_usage: bool, event_fraction: float) -> None:
     if optimize_memory_usage:
         raise ValueError(

@@ -58,8 +58,9 @@ class CostEvalCallback(EvalCallback):
     """
     SB3's ``EvalCallback`` that prefers a feasible model to any infeasible one.
 
-    Among feasible models the best has the highest reward, among infeasible ones the lowest cost. ``evaluations.npz`` gets an
-    array ``costs``, shaped like ``results``. ``best_model.zip`` is replaced at once, never half-written.
+    Among feasible models the best has the highest reward, among infeasible ones the lowest cost; ``best_mean_reward`` is
+    that of the best feasible one, minus infinity before there is one. ``evaluations.npz`` gets an array ``costs``, shaped
+    like ``results``. It and ``best_model.zip`` are replaced at once, never half-written.
 
     :param eval_env: environment to evaluate in
     :param cost_limit: undiscounted cost allowed per episode; None takes the ``cost_limit`` of the model, if it has one,
@@ -138,7 +139,8 @@ class CostEvalCallback(EvalCallback):
         if self._is_success_buffer:
             self.evaluations_successes.append(self._is_success_buffer)
             arrays["successes"] = self.evaluations_successes
-        np.savez(self.log_path, **arrays)
+        with whole_file(self.log_path, ".npz") as target:
+            np.savez(target, **arrays)
 
     def _log_evaluation(self, rewards: list[float], lengths: list[int], costs: list[float], feasible: bool) -> None:
         logs = {
@@ -159,7 +161,10 @@ class CostEvalCallback(EvalCallback):
         self.logger.dump(self.num_timesteps)
 
     def _on_new_best(self) -> bool:
-        self.best_mean_reward, self.best_mean_cost = self.last_mean_reward, self.last_mean_cost
+        feasible, _ = self._best_score
+        # SB3's callbacks that stop a training expect a reward that only rises, and that counts
+        self.best_mean_reward = self.last_mean_reward if feasible else -np.inf
+        self.best_mean_cost = self.last_mean_cost
         if self.verbose >= 1:
             print("New best model!")
         if self.best_model_save_path is not None:

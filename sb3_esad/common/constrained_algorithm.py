@@ -100,7 +100,7 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
             barrier_coef=self.barrier_coef,
             lambda_lr=self.lambda_lr,
             lagrangian_multiplier_init=self.lagrangian_multiplier_init,
-            multiplier_bounds=(min(0.05, self.lagrangian_multiplier_init), self.lagrangian_upper_bound),
+            multiplier_bounds=(max(0.0, min(0.05, self.lagrangian_multiplier_init)), self.lagrangian_upper_bound),
             penalty_coef=self.penalty_coef,
             penalty_warmup=self.penalty_warmup,
         )
@@ -109,10 +109,10 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         """Longest episode the environment admits, until episodes have been seen."""
         if self.env is None:
             return UNKNOWN_LENGTH
-        if self.env.has_attr("max_episode_steps"):
-            return float(self.env.get_attr("max_episode_steps")[0])
-        spec = self.env.get_attr("spec")[0]
-        return float(spec.max_episode_steps or UNKNOWN_LENGTH) if spec else UNKNOWN_LENGTH
+        for name in ("max_episode_steps", "_max_episode_steps"):  # of a scenario, and of gymnasium's TimeLimit
+            if self.env.has_attr(name):
+                return float(self.env.get_attr(name)[0] or UNKNOWN_LENGTH)
+        return UNKNOWN_LENGTH
 
     @property
     def _cost_gamma(self) -> float:

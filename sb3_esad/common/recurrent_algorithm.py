@@ -1,5 +1,7 @@
 """An off-policy algorithm whose policy remembers, and whose every step may have a cost."""
 
+import io
+import pathlib
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
 from stable_baselines3.common.utils import safe_mean
 
-from sb3_esad.common.buffers import SequenceReplayBuffer
+from sb3_esad.common.buffers import SequenceReplayBuffer, refuse_other_buffer
 from sb3_esad.common.checks import refuse_blank_images, refuse_unknown, require
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.memory import keep_freed_memory
@@ -122,8 +124,9 @@ class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
             sde_support=False,
         )
         self._check_action_space()
-        for name in {"sequence_length", "cost_key"} & self.replay_buffer_kwargs.keys():
-            require(False, f"replay_buffer_kwargs[{name!r}]", self.replay_buffer_kwargs[name], f"it as the argument {name}")
+        for name in ("sequence_length", "cost_key"):
+            given = self.replay_buffer_kwargs.get(name)
+            require(given is None, f"replay_buffer_kwargs[{name!r}]", given, f"it as the argument {name}")
         self.sequence_length = sequence_length
         self.random_hold = random_hold
         self.cost_key = cost_key
@@ -155,7 +158,6 @@ class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
             "cost_key": self.cost_key,
         }
         super()._setup_model()
-        keep_freed_memory()
         self._last_latent = None
         self._random_actions: np.ndarray | None = None
         self._episode_costs = EpisodeCosts()
@@ -172,6 +174,21 @@ class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
         if not rollout.continue_training:
             self._last_obs = None  # the step at which a callback stopped was not stored: to go on takes new episodes
         return rollout
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a saved replay buffer; windows are as long, and costs have the key, as this model has it.
+
+        :param path: file that ``save_replay_buffer`` has written
+        :param truncate_last_traj: see SB3's ``OffPolicyAlgorithm.load_replay_buffer``
+        :raises ValueError: if the buffer is of another kind, or of other environments than the model's
+        """
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded, self.replay_buffer = self.replay_buffer, own
+        refuse_other_buffer(loaded, own)
+        loaded.sequence_length, loaded.read_costs = self.sequence_length, own.read_costs
+        self.replay_buffer = loaded
 
     # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
 
@@ -244,6 +261,7 @@ class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
         super().dump_logs()
 
     def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+        keep_freed_memory()
         result = super()._setup_learn(*args, **kwargs)
         if self.num_timesteps == 0:
             self.total_cost = 0.0

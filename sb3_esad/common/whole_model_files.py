@@ -49,4 +49,6 @@ class WholeModelFiles(BaseAlgorithm):
             return super().load(path, *args, **kwargs)
         except (KeyError, RuntimeError) as error:
             reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
-            raise ValueError(f"The model in {path} {reason} ({str(error).partition(chr(10))[0]}).") from error
+            # SB3 looks for another cause of a ValueError, in vain, and raises what it stumbles over
+            cause = error.__context__ if isinstance(error.__context__, ValueError) else error
+            raise ValueError(f"The model in {path} {reason} ({str(cause).partition(chr(10))[0]}).") from error

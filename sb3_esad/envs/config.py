@@ -2,16 +2,91 @@
 
 import difflib
 import math
+from collections.abc import Callable, Sequence
 from numbers import Integral, Real
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-POSITIVE = {
-    *("duration", "route_length", "target_speed", "max_speed", "max_acceleration", "max_braking"),
-    *("max_wheel_angle", "max_lateral_acceleration", "lane_tolerance", "graded_cost_ttc"),
-}
-POSITIVE_PAIRS = {"image_shape", "metres_per_pixel"}
+
+class Rule(NamedTuple):
+    """
+    What the values of some keys must be like.
+
+    :param names: the keys, where a scenario has them
+    :param holds: tells whether a value is
+    :param remedy: the rest of a sentence that begins with "choose"
+    """
+
+    names: Sequence[str]
+    holds: Callable[[Any], bool]
+    remedy: str
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, Real) and math.isfinite(value)
+
+
+def _is_positive(value: Any) -> bool:
+    return _is_finite(value) and value > 0
+
+
+def _is_whole(value: Any, least: int) -> bool:
+    return isinstance(value, Integral) and int(value) >= least
+
+
+def _is_range(value: Any) -> bool:
+    return np.shape(value) == (2,) and all(map(_is_finite, value)) and 0 <= value[0] <= value[1]
+
+
+RULES = (
+    Rule(
+        (
+            *("duration", "route_length", "target_speed", "max_speed", "max_acceleration", "max_braking", "max_wheel_angle"),
+            *("max_lateral_acceleration", "lane_tolerance", "graded_cost_ttc", "merge_length"),
+        ),
+        _is_positive,
+        "a number above 0",
+    ),
+    Rule(
+        (
+            *("velocity_sharpness", "orientation_sharpness", "exploration_decay", "traffic_behind", "traffic_ahead"),
+            *("desired_speed_spread", "slowdown_speed", "slowdown_duration"),
+        ),
+        lambda value: _is_finite(value) and value >= 0,
+        "a number from 0 on",
+    ),
+    Rule(
+        ("ahead", "slow_share", "fast_share", "slowdown_share"),
+        lambda value: _is_finite(value) and 0 <= value <= 1,
+        "a share from 0 to 1",
+    ),
+    Rule(
+        ("start_speed", "headway", "desired_speed", "slow_speed", "fast_speed", "merge_start", "slowdown_start"),
+        _is_range,
+        "two numbers from 0 on, the smaller one first",
+    ),
+    Rule(
+        ("image_shape", "metres_per_pixel"),
+        lambda value: np.shape(value) == (2,) and all(map(_is_positive, value)),
+        "two numbers above 0, along the road and across it",
+    ),
+    Rule(
+        ("physics_frequency", "policy_frequency"),
+        lambda value: _is_whole(value, 1),
+        "a whole number from 1 on",
+    ),
+    Rule(
+        ("neighbours", "merging_cars"),
+        lambda value: _is_whole(value, 0),
+        "a whole number from 0 on",
+    ),
+    Rule(
+        ("lane_counts",),
+        lambda value: np.ndim(value) == 1 and len(value) > 0 and all(_is_whole(lanes, 1) for lanes in value),
+        "a sequence of whole numbers from 1 on",
+    ),
+)
 
 
 def merge_config(defaults: dict[str, Any], given: dict[str, Any]) -> dict[str, Any]:
@@ -43,20 +118,10 @@ def check_config(config: dict[str, Any]) -> None:
     :param config: complete configuration
     :raises ValueError: at the first such value
     """
+    for rule in RULES:
+        for name in rule.names:
+            if name in config and not rule.holds(config[name]):
+                raise ValueError(f"{name} is {config[name]!r}; choose {rule.remedy}")
     physics, policy = config["physics_frequency"], config["policy_frequency"]
-    for name, frequency in (("physics_frequency", physics), ("policy_frequency", policy)):
-        if not isinstance(frequency, Integral) or frequency < 1:
-            raise ValueError(f"{name} is {frequency!r}; choose a whole number from 1 on")
     if physics % policy:
         raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
-    for name in sorted(POSITIVE & config.keys()):
-        if not _is_positive(config[name]):
-            raise ValueError(f"{name} is {config[name]!r}; choose a number above 0")
-    for name in sorted(POSITIVE_PAIRS & config.keys()):
-        pair = config[name]
-        if np.shape(pair) != (2,) or not all(map(_is_positive, pair)):
-            raise ValueError(f"{name} is {pair!r}; choose two numbers above 0, along the road and across it")
-
-
-def _is_positive(value: Any) -> bool:
-    return isinstance(value, Real) and 0 < float(value) < math.inf

@@ -152,6 +152,19 @@ def mean_interval(values: NDArray[np.floating]) -> tuple[float, float]:
     return mean - half, mean + half
 
 
+def poisson_interval(count: float) -> tuple[float, float]:
+    """
+    95 % interval of the expected number of independent events (Garwood, 1936); sensible also at 0.
+
+    :param count: how many there were
+    :return: lower and upper bound
+    """
+    from scipy.stats import chi2
+
+    low = float(chi2.ppf(0.025, 2 * count)) / 2 if count > 0 else 0.0
+    return low, float(chi2.ppf(0.975, 2 * count + 2)) / 2
+
+
 def worst_mean(values: NDArray[np.floating], share: float = WORST_SHARE) -> float:
     """
     Mean of the highest values: the empirical conditional value at risk.
@@ -171,7 +184,8 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
     ``DS``, ``RC``, ``IS`` (0 to 100), ``success`` and ``collision_free`` (shares), ``CO`` (collisions per 100 m), ``CR``
     (collisions per km), ``IPK`` (infractions per km), ``TTC`` and ``TTC_5`` (mean and 5th percentile of the episodes'
     smallest time to collision, s), ``speed`` (m/s), ``return``, ``cost`` and ``cost_cvar`` (mean cost of the worst tenth).
-    ``<name>_low`` and ``<name>_high`` bound 95 % intervals: Wilson's for shares, Student's t for means.
+    ``<name>_low`` and ``<name>_high`` bound 95 % intervals: Wilson's for shares, Poisson's for events per distance,
+    Student's t for means; ``TTC_5`` and ``cost_cvar`` have none.
 
     :param records: of at least one episode
     :return: the figures by name
@@ -198,9 +212,15 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
     for name, values in shares.items():
         figures[name] = float(values.mean())
         figures[f"{name}_low"], figures[f"{name}_high"] = wilson_interval(float(values.sum()), len(values))
-    figures["CR"] = float(columns["collisions"].sum() / kilometres)
-    figures["CO"] = figures["CR"] / 10
-    figures["IPK"] = float(columns["infractions"].sum() / kilometres)
+    hectometres = 10 * kilometres
+    for name, key, distance in (
+        ("CO", "collisions", hectometres),
+        ("CR", "collisions", kilometres),
+        ("IPK", "infractions", kilometres),
+    ):
+        count = float(columns[key].sum())
+        figures[name] = count / distance
+        figures[f"{name}_low"], figures[f"{name}_high"] = (bound / distance for bound in poisson_interval(count))
     figures["TTC_5"] = float(np.percentile(columns["min_ttc"], 5))
     figures["cost_cvar"] = worst_mean(columns["cost"])
     return figures

@@ -52,6 +52,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.config = merge_config(self.default_config(), config or {})
         check_config(self.config)
         self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": self.config["policy_frequency"]}
         self.controls = Controls(*(self.config[name] for name in Controls.__dataclass_fields__))
         self.observation: Observation = OBSERVATIONS[observation](self.config)
         self.observation_space = self.observation.space
@@ -157,6 +158,8 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.episode = Episode(self.route_length)
         self.collided = False
         self.off_road = False
+        if self.render_mode == "human":
+            self.render()
         return self.observation.observe(self), self._state()
 
     def step(self, action: NDArray[np.floating]) -> tuple[Any, float, bool, bool, dict[str, Any]]:
