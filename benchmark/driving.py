@@ -82,7 +82,7 @@ ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {"e
 
 class LearningCurve(BaseCallback):
     """
-    Drives unseen episodes every ``every`` steps.
+    Drives unseen episodes every ``every`` steps, and at the end.
 
     :param path: file to which lines of JSON are appended
     :param every: environment steps
@@ -106,6 +106,10 @@ class LearningCurve(BaseCallback):
             self._evaluate()
             self._resumed = time.monotonic()
         return True
+
+    def _on_training_end(self) -> None:
+        self._seconds += time.monotonic() - self._resumed
+        self._evaluate()
 
     def _evaluate(self) -> None:
         line = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
