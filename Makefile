@@ -30,9 +30,10 @@ benchmark: .venv/.tests
 	$(BIN)/python benchmark/update_speed.py
 	$(BIN)/python benchmark/predict_latency.py
 
-# The demo has ten minutes in all and needs no tools; each stamp is named after the extras that it stands for.
+# The demo has ten minutes in all: it needs no tools, and to compile all of torch takes longer than to import what is used.
+# Each stamp is named after the extras that it stands for.
 .venv/.demo .venv/.tests: setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --constraint constraints.txt --editable ".[$(@:.venv/.%=%)]"
+	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[$(@:.venv/.%=%)]"
 	@touch $@

@@ -16,12 +16,12 @@ from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.hyperparams import load_hyperparams
 from sb3_esad.plots import plot_learning_curve
-from sb3_esad.progress import EpisodeHistory, EpisodeProgressBar, StopAfter
+from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar
 from sb3_esad.report import Figures, format_table, summarise_any
 from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
-TIMESTEPS, MINUTES = 7_000, 7.2
+TIMESTEPS, MINUTES = 6_000, 8.0
 FEW_UPDATES = {"learning_rate": FALLING_RATE}
 """In hundreds of updates a rate that falls from the start moves the networks too little."""
 UNSEEN = 1_000_000
@@ -34,8 +34,8 @@ def run_demo(folder: Path, seed: int = 0, timesteps: int = TIMESTEPS, minutes: f
 
     :param folder: where to write
     :param seed: of the training
-    :param timesteps: environment steps, over which the learning rate falls
-    :param minutes: of training at most
+    :param timesteps: environment steps at most
+    :param minutes: of training at most; the learning rate falls to zero over what comes first
     :param episodes: of the evaluation
     :raises ValueError: if the training was too short for a single episode
     """
@@ -61,7 +61,7 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESAD
 
     :param folder: where to write
     :param seed: of the training
-    :param timesteps: environment steps, over which the learning rate falls
+    :param timesteps: environment steps at most
     :param minutes: at most
     :return: the model, and a sentence about its training
     """
@@ -71,11 +71,11 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESAD
     history = EpisodeHistory()
     print(f"Training ESAD-LEND on {ENV_ID} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
     start = time.monotonic()
-    model.learn(timesteps, callback=[history, EpisodeProgressBar(history), StopAfter(minutes)])
+    model.learn(timesteps, callback=[history, EpisodeProgressBar(history), Deadline(minutes)])
     took = (time.monotonic() - start) / 60
     model.save(folder / "esad_lend.zip")
     plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)
-    clock = "" if model.num_timesteps >= timesteps else ", ended by the clock before the learning rate had fallen to zero"
+    clock = "" if model.num_timesteps >= timesteps else ", ended by the clock"
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
     wanted = f"at most {model.cost_limit} cost per episode wanted"
     return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."

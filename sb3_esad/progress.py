@@ -73,9 +73,12 @@ class EpisodeProgressBar(ProgressBarCallback):
         return super()._on_step()
 
 
-class StopAfter(BaseCallback):
+class Deadline(BaseCallback):
     """
-    Ends a training when its time is over.
+    Ends a training when its time is over, and lets its schedules end with it.
+
+    SB3's schedules follow the share of the steps that have been made. On a machine that is too slow to make them all, the
+    learning rate would still be high at the end; here the share of the time counts where it is the larger one.
 
     :param minutes: from the start of the training
     """
@@ -85,7 +88,10 @@ class StopAfter(BaseCallback):
         self.minutes = minutes
 
     def _on_training_start(self) -> None:
-        self._end = time.monotonic() + 60 * self.minutes
+        self._start, self._wanted = time.monotonic(), self.model._total_timesteps
 
     def _on_step(self) -> bool:
-        return time.monotonic() < self._end
+        elapsed = (time.monotonic() - self._start) / (60 * self.minutes)
+        share = min(max(self.num_timesteps / self._wanted, elapsed), 1.0)
+        self.model._total_timesteps = round(self.num_timesteps / share)
+        return elapsed < 1

@@ -1,6 +1,7 @@
 """Evaluation: every seed once and to its end; tables, dreams, videos and curves of what came of it."""
 
 import re
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluat
 from sb3_esad.envs.metrics import DrivingMetrics
 from sb3_esad.panels import PANEL, SIZE, Gauge, compose, paint
 from sb3_esad.plots import plot_learning_curve
-from sb3_esad.progress import EpisodeHistory, EpisodeProgressBar, StopAfter, TrainingEpisode
+from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar, TrainingEpisode
 from sb3_esad.report import format_table, summarise_any
 from sb3_esad.video import record_driver, record_model, write_video
 
@@ -283,10 +284,24 @@ def test_training_is_followed(tmp_path: Path) -> None:
     assert cv2.imread(str(tmp_path / "curve.png")).std() > 10
 
 
-def test_training_stops_when_its_time_is_over() -> None:
+@pytest.mark.parametrize(("steps", "seconds_a_step", "done"), [(1000, 1.0, 60), (40, 1.0, 40), (40, 0.01, 40)])
+def test_schedules_end_with_the_time(steps: int, seconds_a_step: float, done: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The clock of the test goes on by each look at it; a minute is given."""
+    clock = count(0.0, seconds_a_step)
+    monkeypatch.setattr("sb3_esad.progress.time.monotonic", lambda: next(clock))
     model = make_model("MlpPolicy", learning_starts=10_000)
-    model.learn(100_000, callback=StopAfter(minutes=0.005))
-    assert 0 < model.num_timesteps < 10_000
+    remaining: list[float] = []
+    update = model._update_current_progress_remaining
+
+    def note(num_timesteps: int, total_timesteps: int) -> None:
+        update(num_timesteps, total_timesteps)
+        remaining.append(model._current_progress_remaining)
+
+    monkeypatch.setattr(model, "_update_current_progress_remaining", note)
+    model.learn(steps, callback=Deadline(minutes=1))
+    assert model.num_timesteps == done
+    assert remaining == pytest.approx([1 - (step + 1) / done for step in range(len(remaining))], abs=0.02)
+    assert len(remaining) >= done - 1
 
 
 @pytest.mark.parametrize("cost_limit", [0.05, None])
