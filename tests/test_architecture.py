@@ -21,7 +21,7 @@ LAYERS = [
     "common.rssm common.diffusion",
     "common.world_model common.critics common.selection common.starts",
     "common.agent",
-    "common.policies common.callbacks common.evaluation common.save_util common.whole_model_files",
+    "common.policies common.callbacks common.evaluation common.save_util common.whole_files",
     "common.recurrent_algorithm common.latent_algorithm common.constrained_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",
     "",  # the package itself, which re-exports

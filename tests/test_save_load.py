@@ -260,6 +260,22 @@ def test_replay_buffer(policy: str, n_envs: int, tmp_path: Path) -> None:
     assert other.replay_buffer.size() == 2 * 32 // n_envs
 
 
+def test_a_replay_buffer_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    model = train()
+    model.save_replay_buffer(tmp_path / "buffer")
+    saved = (tmp_path / "buffer.pkl").read_bytes()
+
+    def run_out_of_space(path: Path, *args: Any) -> None:
+        path.write_bytes(saved[:100])
+        raise OSError("No space left on device")
+
+    monkeypatch.setattr("stable_baselines3.common.off_policy_algorithm.save_to_pkl", run_out_of_space)
+    with pytest.raises(OSError, match="No space left"):
+        model.save_replay_buffer(tmp_path / "buffer")
+    assert [path.name for path in tmp_path.iterdir()] == ["buffer.pkl"]
+    assert (tmp_path / "buffer.pkl").read_bytes() == saved
+
+
 def test_a_replay_buffer_takes_the_settings_of_its_model(tmp_path: Path) -> None:
     train(sequence_length=4).save_replay_buffer(tmp_path / "buffer")
     model = ESADLEND("MlpPolicy", make_env("MlpPolicy"), **{**TINY, "sequence_length": 6, "cost_key": "crashed"})

@@ -1,7 +1,5 @@
 """An off-policy algorithm whose policy remembers, and whose every step may have a cost."""
 
-import io
-import pathlib
 from typing import Any
 
 import numpy as np
@@ -10,17 +8,16 @@ from gymnasium import spaces
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
 from stable_baselines3.common.utils import safe_mean
 
-from sb3_esad.common.buffers import SequenceReplayBuffer, refuse_other_buffer
+from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.checks import refuse_blank_images, refuse_unknown, require
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.type_aliases import LatentState
-from sb3_esad.common.whole_model_files import WholeModelFiles
+from sb3_esad.common.whole_files import WholeFiles
 
 NOT_OFFERED = {
     "use_sde": "gSDE is not offered, pass an action_noise instead",
@@ -31,7 +28,7 @@ NOT_OFFERED = {
 """Arguments that other algorithms of SB3 have, and what to do without them."""
 
 
-class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
+class RecurrentOffPolicyAlgorithm(WholeFiles):
     """
     SB3's off-policy algorithm with what it lacks: a memory between two actions, windows of steps to learn from, and costs.
 
@@ -174,21 +171,6 @@ class RecurrentOffPolicyAlgorithm(WholeModelFiles, OffPolicyAlgorithm):
         if not rollout.continue_training:
             self._last_obs = None  # the step at which a callback stopped was not stored: to go on takes new episodes
         return rollout
-
-    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
-        """
-        Load a saved replay buffer; windows are as long, and costs have the key, as this model has it.
-
-        :param path: file that ``save_replay_buffer`` has written
-        :param truncate_last_traj: see SB3's ``OffPolicyAlgorithm.load_replay_buffer``
-        :raises ValueError: if the buffer is of another kind, or of other environments than the model's
-        """
-        own = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, own
-        refuse_other_buffer(loaded, own)
-        loaded.sequence_length, loaded.read_costs = self.sequence_length, own.read_costs
-        self.replay_buffer = loaded
 
     # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
 

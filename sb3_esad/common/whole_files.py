@@ -1,21 +1,24 @@
-"""Saved models that are there as a whole or not at all, and foreign ones that are refused with a reason."""
+"""Saved models and replay buffers that are there as a whole or not at all, and foreign ones that are refused with a reason."""
 
 import io
 import pathlib
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_esad.common.buffers import SequenceReplayBuffer, refuse_other_buffer
 from sb3_esad.common.save_util import check_saved_model, whole_file
 
-SelfWhole = TypeVar("SelfWhole", bound="WholeModelFiles")
+SelfWhole = TypeVar("SelfWhole", bound="WholeFiles")
 
 
-class WholeModelFiles(BaseAlgorithm):
+class WholeFiles(OffPolicyAlgorithm):
     """Saving and loading of an algorithm; :attr:`saved_mark` is an attribute by which its models are told from others."""
 
     saved_mark: ClassVar[str]
+    replay_buffer: SequenceReplayBuffer
+    sequence_length: int
 
     def save(
         self,
@@ -52,3 +55,27 @@ class WholeModelFiles(BaseAlgorithm):
             # SB3 looks for another cause of a ValueError, in vain, and raises what it stumbles over
             cause = error.__context__ if isinstance(error.__context__, ValueError) else error
             raise ValueError(f"The model in {path} {reason} ({str(cause).partition(chr(10))[0]}).") from error
+
+    def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
+        """
+        Save the replay buffer to a file that is there as a whole or not at all.
+
+        :param path: where to; ``.pkl`` is added to a path without a suffix
+        """
+        with whole_file(path, ".pkl") as target:
+            super().save_replay_buffer(target)
+
+    def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
+        """
+        Load a saved replay buffer; windows are as long, and costs have the key, as this model has it.
+
+        :param path: file that :meth:`save_replay_buffer` has written
+        :param truncate_last_traj: see SB3's ``OffPolicyAlgorithm.load_replay_buffer``
+        :raises ValueError: if the buffer is of another kind, or of other environments than the model's
+        """
+        own = self.replay_buffer
+        super().load_replay_buffer(path, truncate_last_traj)
+        loaded, self.replay_buffer = self.replay_buffer, own
+        refuse_other_buffer(loaded, own)
+        loaded.sequence_length, loaded.read_costs = self.sequence_length, own.read_costs
+        self.replay_buffer = loaded
