@@ -95,23 +95,23 @@ class LearningCurve(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._next, self._seconds, self._resumed = self.every, 0.0, time.monotonic()
-        self._cost, self._episodes = 0.0, 0
+        self._cost, self._episodes, self._evaluated = 0.0, 0, 0
 
     def _on_step(self) -> bool:
         self._cost += sum(info["cost"] for info in self.locals["infos"])
         self._episodes += int(self.locals["dones"].sum())
         if self.num_timesteps >= self._next:
             self._next += self.every
-            self._seconds += time.monotonic() - self._resumed
             self._evaluate()
-            self._resumed = time.monotonic()
         return True
 
     def _on_training_end(self) -> None:
-        self._seconds += time.monotonic() - self._resumed
-        self._evaluate()
+        if self.num_timesteps > self._evaluated:
+            self._evaluate()
 
     def _evaluate(self) -> None:
+        self._seconds += time.monotonic() - self._resumed
+        self._evaluated = self.num_timesteps
         line = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
         line |= {"training_cost": self._cost, "training_episodes": self._episodes}
         for name, deterministic in (("best", True), ("sampled", False)):
@@ -120,6 +120,7 @@ class LearningCurve(BaseCallback):
             file.write(json.dumps(line) + "\n")
         self.model.save(self.path.with_suffix(".zip"))
         print(json.dumps(line), flush=True)
+        self._resumed = time.monotonic()
 
 
 def main() -> None:

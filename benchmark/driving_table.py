@@ -91,7 +91,8 @@ def main() -> None:
         )
     for name, run in runs.items():
         print(f"\n{name}: {ending(run[-1])}")
-        if len(settled := [line for line in run if line["steps"] > args.first]) > 1:
+        settled = [line for line in run if line["steps"] > args.first]
+        if len({line["training_episodes"] for line in settled}) > 1:
             print(budget(settled))
 
 
