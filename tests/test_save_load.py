@@ -277,10 +277,14 @@ def test_a_replay_buffer_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pyt
 
 
 def test_a_replay_buffer_takes_the_settings_of_its_model(tmp_path: Path) -> None:
-    train(sequence_length=4).save_replay_buffer(tmp_path / "buffer")
+    before = train(sequence_length=4)
+    before._sample(2)  # the places of its windows are remembered, and saved with it
+    before.save_replay_buffer(tmp_path / "buffer")
     model = ESADLEND("MlpPolicy", make_env("MlpPolicy"), **{**TINY, "sequence_length": 6, "cost_key": "crashed"})
     model.load_replay_buffer(tmp_path / "buffer")
     assert model._sample(2).rewards.shape == (2, 6)
+    assert model.replay_buffer._windows is not None
+    assert model.replay_buffer._windows.n_starts == model.replay_buffer.size() - 5
     assert model.replay_buffer.read_costs.cost_key == "crashed"
 
 

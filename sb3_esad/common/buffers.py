@@ -85,6 +85,15 @@ class SequenceReplayBuffer(ReplayBuffer):
         self.episode_starts = np.zeros(shape, dtype=bool)
         self._windows: WindowIndex | None = None
 
+    def take_settings_of(self, other: "SequenceReplayBuffer") -> None:
+        """
+        Return windows as long, and read costs by the same key, as another buffer.
+
+        :param other: the buffer whose place this one takes
+        """
+        self.sequence_length, self.read_costs = other.sequence_length, other.read_costs
+        self._windows = None  # those drawn last were for the former length
+
     def reset(self) -> None:
         """Forget everything."""
         super().reset()

@@ -18,7 +18,6 @@ class WholeFiles(OffPolicyAlgorithm):
 
     saved_mark: ClassVar[str]
     replay_buffer: SequenceReplayBuffer
-    sequence_length: int
 
     def save(
         self,
@@ -74,8 +73,11 @@ class WholeFiles(OffPolicyAlgorithm):
         :raises ValueError: if the buffer is of another kind, or of other environments than the model's
         """
         own = self.replay_buffer
-        super().load_replay_buffer(path, truncate_last_traj)
-        loaded, self.replay_buffer = self.replay_buffer, own
+        try:
+            super().load_replay_buffer(path, truncate_last_traj)
+            loaded = self.replay_buffer
+        finally:
+            self.replay_buffer = own
         refuse_other_buffer(loaded, own)
-        loaded.sequence_length, loaded.read_costs = self.sequence_length, own.read_costs
+        loaded.take_settings_of(own)
         self.replay_buffer = loaded
