@@ -13,7 +13,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 # From the lowest to the highest; a module may import those of its own and of lower layers.
 LAYERS = [
     "common.type_aliases common.functional common.transforms common.torch_layers common.target_networks common.optimizers",
-    "common.precision common.checks common.memory common.schedules",
+    "common.precision common.checks common.memory common.schedules common.side_by_side",
     "common.costs common.frames common.windows common.buffers",
     "common.recent_sums",
     "common.episode_record common.penalties common.multipliers common.entropy",

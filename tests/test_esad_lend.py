@@ -575,7 +575,7 @@ def test_recorded_transitions_lead_from_before_to_after() -> None:
     names = (10.0 * th.arange(2) + th.arange(3.0)[:, None])[..., None, None, None]
     before, after = (LatentState(each, each, each[..., 0, 0]) for each in (names, names + 0.5))
     gaussian = Gaussian(names, names)
-    filtered = Filtered(after, before, gaussian, gaussian, th.zeros(3, 2) > 0, th.zeros(3, 2) > 0)
+    filtered = Filtered(after, before, gaussian, gaussian, names, th.zeros(3, 2) > 0, th.zeros(3, 2) > 0)
     batch_major = names[..., 0, 0, 0].T
     samples = SimpleNamespace(
         rewards=batch_major, costs=batch_major / 100, continues=batch_major / 10, event_weights=th.tensor([1.0, 2.0])

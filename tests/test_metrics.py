@@ -12,6 +12,7 @@ from sb3_esad.envs.metrics import (
     LONGEST_TTC,
     DrivingMetrics,
     Episode,
+    bootstrap_interval,
     mean_interval,
     poisson_interval,
     summarise,
@@ -192,3 +193,18 @@ def test_wrapper_says_what_is_missing() -> None:
     env.reset()
     with pytest.raises(KeyError, match="wrap a scenario"):
         env.step(0)
+
+
+def test_resampled_interval_of_a_mean_is_that_of_the_normal_distribution() -> None:
+    values = np.random.default_rng(3).exponential(size=400)
+    low, high = bootstrap_interval(values, lambda draw: float(np.mean(draw)))
+    half = 1.96 * values.std() / math.sqrt(400)
+    assert (low, high) == pytest.approx((values.mean() - half, values.mean() + half), abs=0.15 * half)
+    assert bootstrap_interval(np.array([7.0]), worst_mean) == (7.0, 7.0)
+
+
+def test_resampled_interval_holds_the_truth_of_a_tail() -> None:
+    """The worst tenth of an exponential distribution has the mean 1 + ln 10."""
+    random = np.random.default_rng(4)
+    intervals = [bootstrap_interval(random.exponential(size=200), worst_mean) for _ in range(60)]
+    assert 0.85 <= np.mean([low < 1 + math.log(10) < high for low, high in intervals]) <= 1.0

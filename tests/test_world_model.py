@@ -48,7 +48,7 @@ def float32(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.fixture
 def deterministic(monkeypatch: pytest.MonkeyPatch, float32: None) -> None:
     """Latents are the means of their distributions."""
-    monkeypatch.setattr(Gaussian, "sample", lambda self: self.mean)
+    monkeypatch.setattr(Gaussian, "sample", lambda self, generator=None: self.mean)
 
 
 def make_policy(space: spaces.Space, lr: float = 3e-3, **kwargs: Any) -> LatentPolicy:
@@ -215,6 +215,22 @@ def test_stretches_that_are_withheld() -> None:
     assert not model._withhold(th.zeros(1, 50)).any()
 
 
+def test_a_head_can_infer_again_from_what_its_loss_is_given(monkeypatch: pytest.MonkeyPatch) -> None:
+    model = make_policy(IMAGE).world_model
+    head, caught = model.rssm.head, []
+
+    def catch(*arguments: Any) -> tuple[th.Tensor, dict[str, float]]:
+        caught.extend(arguments)
+        return th.zeros(()), {}
+
+    monkeypatch.setattr(head, "loss", catch)
+    model.loss(make_samples(IMAGE, [[1, 0, 0, 1, 0], [0, 0, 1, 0, 0]]))
+    posterior, prior, memory, embedding = caught
+    again = head.posterior(memory.flatten(0, 1), embedding.flatten(0, 1))
+    th.testing.assert_close(again.mean, posterior.mean.flatten(0, 1))
+    th.testing.assert_close(head.prior(memory.flatten(0, 1)).std, prior.std.flatten(0, 1))
+
+
 class Oracle(LatentHead):
     """The latent is the observation itself."""
 
@@ -230,7 +246,9 @@ class Oracle(LatentHead):
     def sample(self, memory: th.Tensor, embedding: th.Tensor | None = None, n_candidates: int = 1) -> th.Tensor:
         return th.zeros_like(memory)
 
-    def loss(self, posterior: Gaussian, prior: Gaussian) -> tuple[th.Tensor, dict[str, float]]:
+    def loss(
+        self, posterior: Gaussian, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor
+    ) -> tuple[th.Tensor, dict[str, float]]:
         return th.zeros(()), {}
 
 
@@ -260,7 +278,7 @@ def test_targets_belong_to_the_state_arrived_at(monkeypatch: pytest.MonkeyPatch,
         caught.append((grid, targets, weights))
         return th.zeros(()), {}
 
-    monkeypatch.setattr(model, "_withhold", lambda steps: th.zeros_like(steps, dtype=th.bool))
+    monkeypatch.setattr(model, "_withhold", lambda steps, _: th.zeros_like(steps, dtype=th.bool))
     monkeypatch.setattr(model.predictions, "loss", catch)
     samples = buffer.sample(16)._replace(event_weights=th.arange(16.0))
     model.loss(samples)
@@ -539,7 +557,7 @@ def make_filtered(is_first: list[list[int]], hidden: list[list[int]]) -> Filtere
     names = (100 * th.arange(n) + th.arange(length)[:, None]).float()[..., None, None, None]
     state = LatentState(names, names, names[..., 0, 0])
     gaussian = Gaussian(names, names)
-    return Filtered(state, state, gaussian, gaussian, opens, blind)
+    return Filtered(state, state, gaussian, gaussian, names, opens, blind)
 
 
 def test_settled_states() -> None:
@@ -601,14 +619,15 @@ def test_any_start_is_better_than_none() -> None:
 def test_free_nats_stop_the_pull() -> None:
     """Below the free nats neither distribution is moved; above them both are, towards each other."""
     head = GaussianHead((4, 1, 1), 4, 2, 4, free_nats=1.0)
+    nothing = (th.zeros(5, 4, 1, 1), th.zeros(5, 4, 1, 1))
     near = Gaussian(th.zeros(5, 2, 1, 1, requires_grad=True), th.ones(5, 2, 1, 1))
     prior = Gaussian(th.zeros(5, 2, 1, 1, requires_grad=True), th.ones(5, 2, 1, 1))
-    loss, logs = head.loss(near, prior)
+    loss, logs = head.loss(near, prior, *nothing)
     loss.backward()
     assert loss.item() == pytest.approx(0.6) and logs["kl"] == pytest.approx(0.0)
     assert near.mean.grad is not None and (near.mean.grad == 0).all()
     far = Gaussian(th.full((5, 2, 1, 1), 3.0, requires_grad=True), th.ones(5, 2, 1, 1))
-    loss, logs = head.loss(far, prior)
+    loss, logs = head.loss(far, prior, *nothing)
     assert logs["kl"] == pytest.approx(9.0) and loss.item() == pytest.approx(0.6 * 9.0)
     loss.backward()
     assert far.mean.grad is not None and prior.mean.grad is not None

@@ -2,6 +2,8 @@
 
 from abc import abstractmethod
 from collections import defaultdict
+from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
@@ -15,6 +17,7 @@ from sb3_esad.common.precision import autocast
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.schedules import HoldThenFall
+from sb3_esad.common.side_by_side import side_by_side
 from sb3_esad.common.starts import choose_starts
 from sb3_esad.common.target_networks import update_target
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
@@ -108,22 +111,35 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         :param gradient_steps: number of updates
         :param batch_size: windows in a batch
         """
-        if not self._has_enough_steps():
+        if gradient_steps < 1 or not self._has_enough_steps():
             return
         self.policy.set_training_mode(True)
         self._update_learning_rate(list(self._optimizers().values()))
-        logs: dict[str, list[float]] = defaultdict(list)
         for _ in range(self.pretrain_steps if self._n_updates == 0 else 0):
             self._update_world_model(self._sample(batch_size))
-        for _ in range(gradient_steps):
-            samples = self._sample(batch_size)
-            filtered, model_logs = self._update_world_model(samples)
-            with autocast(self.device):
-                behavior_logs = self._update_behavior(samples, filtered, self._imagine(samples, filtered))
-            for name, value in {**model_logs, **behavior_logs}.items():
+        logs: dict[str, list[float]] = defaultdict(list)
+        for update_logs in self._updates(gradient_steps, batch_size):
+            for name, value in update_logs.items():
                 logs[name].append(value)
         self._n_updates += gradient_steps
         self._record(logs)
+
+    def _updates(self, n: int, batch_size: int) -> Iterator[Logs]:
+        """
+        Update model and behaviour in turns.
+
+        While the behaviour learns, the model is not moved: its next gradient is computed meanwhile.
+        """
+        samples = self._sample(batch_size)
+        filtered, model_logs = self._update_world_model(samples)
+        for _ in range(n - 1):
+            following = self._sample(batch_size)
+            learn, fit = partial(self._learn_behavior, samples, filtered), self._fitting(following)
+            behavior_logs, (next_filtered, next_logs) = side_by_side(learn, fit, self.device)
+            next_logs["model_grad_norm"] = self._move("world_model")
+            yield {**model_logs, **behavior_logs}
+            samples, filtered, model_logs = following, next_filtered, next_logs
+        yield {**model_logs, **self._learn_behavior(samples, filtered)}
 
     @abstractmethod
     def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
@@ -139,21 +155,42 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _sample(self, batch_size: int) -> SequenceSamples:
         return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
 
-    def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
+    def _learn_behavior(self, samples: SequenceSamples, filtered: Filtered) -> Logs:
         with autocast(self.device):
-            loss, filtered, logs = self.policy.world_model.loss(samples)
-        logs["model_grad_norm"] = self._step("world_model", loss)
-        return filtered.detach(), logs
+            return self._update_behavior(samples, filtered, self._imagine(samples, filtered))
+
+    def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
+        filtered, logs = self._fitting(samples)()
+        logs["model_grad_norm"] = self._move("world_model")
+        return filtered, logs
+
+    def _fitting(self, samples: SequenceSamples) -> Callable[[], tuple[Filtered, Logs]]:
+        """Draw what is random about a gradient of the world model, and give the job that computes it."""
+        generator = th.Generator(self.device).manual_seed(int(th.randint(2**62, ()).item()))
+
+        def fit() -> tuple[Filtered, Logs]:
+            with autocast(self.device):
+                loss, filtered, logs = self.policy.world_model.loss(samples, generator)
+            self._differentiate("world_model", loss)
+            return filtered.detach(), logs
+
+        return fit
 
     def _step(self, name: str, loss: th.Tensor) -> float:
-        """Minimise a loss by one step of one network, which its target follows; whatever else it passed through stays."""
+        """Minimise a loss by one step of one network; whatever else it passed through stays."""
+        self._differentiate(name, loss)
+        return self._move(name)
+
+    def _differentiate(self, name: str, loss: th.Tensor) -> None:
         network = getattr(self.policy, name)
-        parameters = list(network.parameters())
         network.optimizer.zero_grad()
-        loss.backward(inputs=parameters)
-        norm = th.nn.utils.clip_grad_norm_(parameters, self.max_grad_norm)
+        loss.backward(inputs=list(network.parameters()))
+
+    def _move(self, name: str) -> float:
+        """Move a network against its gradient, and its target after it."""
+        network = getattr(self.policy, name)
+        norm = th.nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
         network.optimizer.step()
-        th.clear_autocast_cache()  # it holds the weights as they were, and the next network would be improved by old ones
         update_target(network, getattr(self.policy, f"{name}_target"), self.tau)
         return norm.item()
 

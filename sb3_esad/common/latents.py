@@ -23,14 +23,15 @@ class Gaussian(NamedTuple):
     mean: th.Tensor
     std: th.Tensor
 
-    def sample(self) -> th.Tensor:
+    def sample(self, generator: th.Generator | None = None) -> th.Tensor:
         """
         Draw a reparameterised sample.
 
+        :param generator: of the noise; torch's global one if there is none
         :return: shape of ``mean``
         """
         # Noise with the channels last in memory, as everything else on the grid
-        noise = th.randn(self.mean.movedim(-3, -1).shape, device=self.mean.device).movedim(-1, -3)
+        noise = th.randn(self.mean.movedim(-3, -1).shape, device=self.mean.device, generator=generator).movedim(-1, -3)
         return self.mean + self.std * noise
 
     def detach(self) -> "Gaussian":
@@ -97,12 +98,14 @@ class LatentHead(nn.Module, ABC):
         """
 
     @abstractmethod
-    def loss(self, posterior: Gaussian, prior: Gaussian) -> tuple[th.Tensor, Logs]:
+    def loss(self, posterior: Gaussian, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, Logs]:
         """
-        Fit prior and posterior to each other.
+        Fit prior and posterior to each other, and whatever else the head draws its latents with.
 
         :param posterior: q(z | h, o), of shape (..., C, H, W)
         :param prior: p(z | h), of the same shape
+        :param memory: h, from which both were inferred, of shape (..., C', H, W)
+        :param embedding: what :meth:`embed` made of the observation, of shape (..., C'', H, W)
         :return: scalar loss, and what to log
         """
 
@@ -156,7 +159,7 @@ class GaussianHead(LatentHead):
         gaussian = self.prior(memory) if embedding is None else self.posterior(memory, embedding)
         return Gaussian(*(th.cat([parameter] * n_candidates) for parameter in gaussian)).sample()
 
-    def loss(self, posterior: Gaussian, prior: Gaussian) -> tuple[th.Tensor, Logs]:
+    def loss(self, posterior: Gaussian, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, Logs]:
         dynamics = kl_divergence(posterior.detach(), prior)
         representation = kl_divergence(posterior, prior.detach())
         terms = (dynamics, representation)

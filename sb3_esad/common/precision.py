@@ -23,11 +23,13 @@ def autocast(device: th.device) -> AbstractContextManager[None]:
     """
     Compute convolutions and matrix products in bfloat16 where that is native.
 
+    Without autocast's cache of converted weights: it would be shared by threads, and outlive a step of the optimiser.
+
     :param device: where the networks live
     :return: a context, which does nothing elsewhere
     """
     if has_fast_bfloat16(device):
-        return th.autocast(device.type, dtype=th.bfloat16)
+        return th.autocast(device.type, dtype=th.bfloat16, cache_enabled=False)
     return contextlib.nullcontext()
 
 

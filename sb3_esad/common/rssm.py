@@ -61,6 +61,7 @@ class Filtered(NamedTuple):
     :param before: state before each step's action, where an episode or a window starts it is the filtered first observation
     :param posterior: q(z | h, o) of each step
     :param prior: p(z | h) of each step
+    :param embeddings: what the head made of each step's observation, withheld ones included, of shape (T, B, C, H, W)
     :param is_first: whether the model started afresh at the step, of shape (T, B)
     :param hidden: whether the step's observation was withheld, of shape (T, B)
     """
@@ -69,6 +70,7 @@ class Filtered(NamedTuple):
     before: LatentState
     posterior: Gaussian
     prior: Gaussian
+    embeddings: th.Tensor
     is_first: th.Tensor
     hidden: th.Tensor
 
@@ -79,7 +81,8 @@ class Filtered(NamedTuple):
         :return: the same states as constants
         """
         states, before = (state.map(th.Tensor.detach) for state in (self.states, self.before))
-        return Filtered(states, before, self.posterior.detach(), self.prior.detach(), self.is_first, self.hidden)
+        posterior, prior = self.posterior.detach(), self.prior.detach()
+        return Filtered(states, before, posterior, prior, self.embeddings.detach(), self.is_first, self.hidden)
 
     def settled(self, steps: int, episode_starts: th.Tensor) -> th.Tensor:
         """
@@ -149,21 +152,35 @@ class RSSM(nn.Module):
         memory = self.advance(state)
         return LatentState(memory, self.head.sample(memory), th.zeros_like(state.action))
 
-    def filter(self, state: LatentState, embedding: th.Tensor, deterministic: bool = False) -> LatentState:
+    def filter(
+        self,
+        state: LatentState,
+        embedding: th.Tensor,
+        deterministic: bool = False,
+        generator: th.Generator | None = None,
+    ) -> LatentState:
         """
         Move on by one step with an observation.
 
         :param state: the previous state and the executed action
         :param embedding: features prepared by the head, of shape (N, C', H, W)
         :param deterministic: take the mean of the latent instead of a sample
+        :param generator: of the sample; torch's global one if there is none
         :return: the next state, its action still zero
         """
         memory = self.advance(state)
         posterior = self.head.posterior(memory, embedding)
-        return LatentState(memory, posterior.mean if deterministic else posterior.sample(), th.zeros_like(state.action))
+        latent = posterior.mean if deterministic else posterior.sample(generator)
+        return LatentState(memory, latent, th.zeros_like(state.action))
 
     def scan(
-        self, first: LatentState, is_first: th.Tensor, actions: th.Tensor, embeddings: th.Tensor, hidden: th.Tensor
+        self,
+        first: LatentState,
+        is_first: th.Tensor,
+        actions: th.Tensor,
+        embeddings: th.Tensor,
+        hidden: th.Tensor,
+        generator: th.Generator | None = None,
     ) -> Filtered:
         """
         Filter whole windows.
@@ -173,6 +190,7 @@ class RSSM(nn.Module):
         :param actions: executed actions, of shape (T, B, A)
         :param embeddings: of the observation after each action, of shape (T, B, C', H, W)
         :param hidden: steps whose observation is withheld, so that the prior learns to go on alone, of shape (T, B)
+        :param generator: of the samples; torch's global one if there is none
         :return: all states and distributions
         """
         resets = is_first.sum(1).tolist()
@@ -187,12 +205,13 @@ class RSSM(nn.Module):
             memory = self.advance(state)
             prior, posterior = self.head.prior(memory), self.head.posterior(memory, embedding)
             blind = hidden[t, :, None, None, None]
-            latent = Gaussian(*(th.where(blind, p, q) for p, q in zip(prior, posterior, strict=True))).sample()
+            latent = Gaussian(*(th.where(blind, p, q) for p, q in zip(prior, posterior, strict=True))).sample(generator)
             state = LatentState(memory, latent, th.zeros_like(action))
             states.append(state)
             posteriors.append(posterior)
             priors.append(prior)
-        return Filtered(_stack(states), _stack(befores), _stack(posteriors), _stack(priors), is_first, hidden)
+        steps = (_stack(states), _stack(befores), _stack(posteriors), _stack(priors))
+        return Filtered(*steps, embeddings, is_first, hidden)
 
 
 def _stack(items: list[Record]) -> Record:

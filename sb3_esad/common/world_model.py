@@ -102,23 +102,31 @@ class WorldModel(LearningModule):
         features = self.features_extractor(self._preprocess(observations))
         return self.rssm.head.embed(features.unflatten(1, self.embedding_shape))
 
-    def filter(self, state: LatentState, observations: Observations, deterministic: bool = False) -> LatentState:
+    def filter(
+        self,
+        state: LatentState,
+        observations: Observations,
+        deterministic: bool = False,
+        generator: th.Generator | None = None,
+    ) -> LatentState:
         """
         Take in one observation.
 
         :param state: the previous state and the executed action, or :meth:`initial`
         :param observations: as stored, of shape (N, ...)
         :param deterministic: take the mean of the latent instead of a sample
+        :param generator: of the sample; torch's global one if there is none
         :return: the next state
         """
-        return self.rssm.filter(state, self.embed(observations), deterministic)
+        return self.rssm.filter(state, self.embed(observations), deterministic, generator)
 
-    def observe(self, samples: SequenceSamples, hidden: th.Tensor) -> Filtered:
+    def observe(self, samples: SequenceSamples, hidden: th.Tensor, generator: th.Generator | None = None) -> Filtered:
         """
         Filter windows of recorded steps.
 
         :param samples: windows, batch-major
         :param hidden: steps whose observation is withheld, of shape (T, B)
+        :param generator: of the samples; torch's global one if there is none
         :return: states and distributions, time-major
         """
         actions = samples.actions.transpose(0, 1)
@@ -126,8 +134,8 @@ class WorldModel(LearningModule):
         is_first[0] = True  # the model starts afresh at the start of a window too
         opening = _map(samples.observations, lambda x: x.transpose(0, 1)[is_first])
         embeddings = self.embed(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)))
-        first = self.filter(self.initial(int(is_first.sum())), opening)
-        return self.rssm.scan(first, is_first, actions, embeddings.unflatten(0, actions.shape[:2]), hidden)
+        first = self.filter(self.initial(int(is_first.sum())), opening, generator=generator)
+        return self.rssm.scan(first, is_first, actions, embeddings.unflatten(0, actions.shape[:2]), hidden, generator)
 
     def imagine(self, start: LatentState, policy: Callable[[th.Tensor], th.Tensor], horizon: int, gamma: float) -> Imagination:
         """
@@ -177,34 +185,35 @@ class WorldModel(LearningModule):
         """
         return {key: head(self.features(states)) for key, head in self._observation_heads()}
 
-    def loss(self, samples: SequenceSamples) -> tuple[th.Tensor, Filtered, Logs]:
+    def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, Logs]:
         """
         Fit the model to windows of recorded steps.
 
         :param samples: windows, batch-major
+        :param generator: of all that is drawn; torch's global one if there is none
         :return: scalar loss, the filtered states, and what to log
         """
         steps = samples.rewards.T
-        filtered = self.observe(samples, self._withhold(steps))
+        filtered = self.observe(samples, self._withhold(steps, generator), generator)
         grid = self.features(filtered.states.map(lambda field: field.flatten(0, 1)))
         targets = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
         weights = samples.event_weights.expand_as(steps).flatten()
         prediction_loss, logs = self.predictions.loss(grid, targets, weights)
-        kl_loss, kl_logs = self.rssm.head.loss(filtered.posterior, filtered.prior)
+        kl_loss, kl_logs = self.rssm.head.loss(filtered.posterior, filtered.prior, filtered.states.memory, filtered.embeddings)
         # Decoding is the dearest part, and half of the frames say as much about the other half
-        some = th.randperm(len(grid), device=grid.device)[: (len(grid) + 1) // 2]
+        some = th.randperm(len(grid), device=grid.device, generator=generator)[: (len(grid) + 1) // 2]
         seen = self._preprocess(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)[some]))
         observation_losses = [head.loss(grid[some], _by_key(seen)[key]) for key, head in self._observation_heads()]
         observation_loss = th.stack(observation_losses).sum()
         loss = observation_loss + prediction_loss + kl_loss
         return loss, filtered, {**logs, **kl_logs, "observation_loss": observation_loss.item()}
 
-    def _withhold(self, steps: th.Tensor) -> th.Tensor:
+    def _withhold(self, steps: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         # Every window hides one stretch, so that the prior is trained on what it will be used for: going on alone
         length, n = steps.shape
         index = th.arange(length, device=steps.device)[:, None]
-        start = th.randint(1, max(2, length), (n,), device=steps.device)
-        stretch = th.randint(1, self.open_loop_length + 1, (n,), device=steps.device)
+        start = th.randint(1, max(2, length), (n,), device=steps.device, generator=generator)
+        stretch = th.randint(1, self.open_loop_length + 1, (n,), device=steps.device, generator=generator)
         return (index >= start) & (index < start + stretch)
 
     def _observation_heads(self) -> ItemsView[str, ObservationHead]:

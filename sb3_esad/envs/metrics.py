@@ -1,7 +1,7 @@
 """Driving metrics of the paper (section "Evaluation Metrics"): one record per episode, one row of figures per experiment."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, SupportsFloat
 
 import gymnasium
@@ -9,12 +9,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 Record = dict[str, float]
+Columns = Mapping[str, NDArray[np.floating]]
+Figure = tuple[str, float, tuple[float, float]]
 
 PENALTIES = {"person": 0.50, "vehicle": 0.60, "static": 0.65, "red_light": 0.70}
 COLLISIONS = ("person", "vehicle", "static")
 LONGEST_TTC = 20.0  # a time to collision above this is no risk worth telling apart [s]
 Z_95 = 1.959964
 WORST_SHARE = 0.1
+RESAMPLES = 1000
+MEANS = (
+    ("DS", 100.0, "driving_score"),
+    ("RC", 100.0, "route_completion"),
+    ("IS", 100.0, "infraction_score"),
+    ("TTC", 1.0, "min_ttc"),
+    ("speed", 1.0, "mean_speed"),
+    ("return", 1.0, "return"),
+    ("cost", 1.0, "cost"),
+)
+"""Figures that are means: name, scale, key of the record."""
 
 
 class Episode:
@@ -177,6 +190,21 @@ def worst_mean(values: NDArray[np.floating], share: float = WORST_SHARE) -> floa
     return float(np.sort(values)[-count:].mean())
 
 
+def bootstrap_interval(
+    values: NDArray[np.floating], statistic: Callable[[NDArray[np.floating]], float]
+) -> tuple[float, float]:
+    """
+    95 % interval of any figure (Efron, 1979: percentiles over resamples), for those that have none in closed form.
+
+    :param values: independent, shape ``(n,)``
+    :param statistic: from values to the figure
+    :return: lower and upper bound, the same for the same values
+    """
+    draws = np.random.default_rng(0).choice(values, (RESAMPLES, len(values)))
+    low, high = np.percentile([statistic(draw) for draw in draws], (2.5, 97.5))
+    return float(low), float(high)
+
+
 def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
     """
     Turn episode records into the figures of a table.
@@ -185,7 +213,7 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
     (collisions per km), ``IPK`` (infractions per km), ``TTC`` and ``TTC_5`` (mean and 5th percentile of the episodes'
     smallest time to collision, s), ``speed`` (m/s), ``return``, ``cost`` and ``cost_cvar`` (mean cost of the worst tenth).
     ``<name>_low`` and ``<name>_high`` bound 95 % intervals: Wilson's for shares, Poisson's for events per distance,
-    Student's t for means; ``TTC_5`` and ``cost_cvar`` have none.
+    Student's t for means, resampling for ``TTC_5`` and ``cost_cvar``.
 
     :param records: of at least one episode
     :return: the figures by name
@@ -194,33 +222,38 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
     if not records:
         raise ValueError("summarise() got no records; run at least one episode to its end")
     columns = {name: np.array([record[name] for record in records], dtype=np.float64) for name in records[0]}
-    means = {
-        "DS": 100 * columns["driving_score"],
-        "RC": 100 * columns["route_completion"],
-        "IS": 100 * columns["infraction_score"],
-        "TTC": columns["min_ttc"],
-        "speed": columns["mean_speed"],
-        "return": columns["return"],
-        "cost": columns["cost"],
-    }
-    shares = {"success": columns["success"], "collision_free": columns["collisions"] == 0}
-    kilometres = max(columns["distance"].sum() / 1000, 1e-9)
     figures = {"episodes": float(len(records))}
-    for name, values in means.items():
-        figures[name] = float(values.mean())
-        figures[f"{name}_low"], figures[f"{name}_high"] = mean_interval(values)
-    for name, values in shares.items():
-        figures[name] = float(values.mean())
-        figures[f"{name}_low"], figures[f"{name}_high"] = wilson_interval(float(values.sum()), len(values))
-    hectometres = 10 * kilometres
+    for name, value, (low, high) in (*_means(columns), *_shares(columns), *_rates(columns), *_tails(columns)):
+        figures |= {name: value, f"{name}_low": low, f"{name}_high": high}
+    return figures
+
+
+def _means(columns: Columns) -> Iterator[Figure]:
+    for name, scale, key in MEANS:
+        values = scale * columns[key]
+        yield name, float(values.mean()), mean_interval(values)
+
+
+def _shares(columns: Columns) -> Iterator[Figure]:
+    for name, values in (("success", columns["success"]), ("collision_free", columns["collisions"] == 0)):
+        yield name, float(values.mean()), wilson_interval(float(values.sum()), len(values))
+
+
+def _rates(columns: Columns) -> Iterator[Figure]:
+    kilometres = max(columns["distance"].sum() / 1000, 1e-9)
     for name, key, distance in (
-        ("CO", "collisions", hectometres),
+        ("CO", "collisions", 10 * kilometres),
         ("CR", "collisions", kilometres),
         ("IPK", "infractions", kilometres),
     ):
         count = float(columns[key].sum())
-        figures[name] = count / distance
-        figures[f"{name}_low"], figures[f"{name}_high"] = (bound / distance for bound in poisson_interval(count))
-    figures["TTC_5"] = float(np.percentile(columns["min_ttc"], 5))
-    figures["cost_cvar"] = worst_mean(columns["cost"])
-    return figures
+        low, high = poisson_interval(count)
+        yield name, count / distance, (low / distance, high / distance)
+
+
+def _tails(columns: Columns) -> Iterator[Figure]:
+    for name, values, statistic in (
+        ("TTC_5", columns["min_ttc"], lambda values: float(np.percentile(values, 5))),
+        ("cost_cvar", columns["cost"], worst_mean),
+    ):
+        yield name, statistic(values), bootstrap_interval(values, statistic)
