@@ -13,6 +13,8 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from sb3_esad import ESADLEND
 
 BATCH, LENGTH = 16, 32
+ROUND = 8
+"""Updates in one call, as in hyperparams/esad_lend.yml: they overlap within it; SAC's do not."""
 
 
 def prepared(model: OffPolicyAlgorithm, steps: int) -> OffPolicyAlgorithm:
@@ -27,22 +29,23 @@ def prepared(model: OffPolicyAlgorithm, steps: int) -> OffPolicyAlgorithm:
     return model.learn(steps)
 
 
-def seconds(update: Callable[[], None]) -> float:
+def seconds(train: Callable[[int, int], None], batch_size: int) -> float:
     """
-    Time one call.
+    Time one update, as a part of a round of them.
 
-    :param update: what to time
-    :return: wall-clock [s]
+    :param train: does a number of updates on batches of a size
+    :param batch_size: windows or frames
+    :return: wall-clock of one update [s]
     """
     start = time.perf_counter()
-    update()
-    return time.perf_counter() - start
+    train(ROUND, batch_size)
+    return (time.perf_counter() - start) / ROUND
 
 
 def main() -> None:
     """Alternate updates of both, print medians and their ratio."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=10)
+    parser.add_argument("--repeats", type=int, default=5, help=f"rounds of {ROUND} updates")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     th.set_num_threads(args.threads)
@@ -51,13 +54,13 @@ def main() -> None:
         ESADLEND("CnnPolicy", env, learning_starts=steps, batch_size=BATCH, sequence_length=LENGTH, pretrain_steps=0), steps
     )
     sac = prepared(SAC("CnnPolicy", env, learning_starts=steps, buffer_size=2000, batch_size=BATCH * LENGTH), steps)
-    updates = {"ESAD-LEND": lambda: ours.train(1, BATCH), "SAC": lambda: sac.train(1, BATCH * LENGTH)}
-    for update in updates.values():
-        update()  # the first call allocates
-    times: dict[str, list[float]] = {name: [] for name in updates}
+    rivals = {"ESAD-LEND": (ours.train, BATCH), "SAC": (sac.train, BATCH * LENGTH)}
+    for train, batch_size in rivals.values():
+        train(1, batch_size)  # the first call allocates
+    times: dict[str, list[float]] = {name: [] for name in rivals}
     for _ in range(args.repeats):
-        for name, update in updates.items():
-            times[name].append(seconds(update))
+        for name, rival in rivals.items():
+            times[name].append(seconds(*rival))
     medians = {name: float(np.median(values)) for name, values in times.items()}
     for name, values in times.items():
         print(f"{name:10s} median {medians[name]:.3f} s, from {min(values):.3f} to {max(values):.3f} s")
