@@ -169,7 +169,10 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")
-def test_demo_too_short_for_an_episode(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_demo_too_short_for_an_episode(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(demo.FEW_UPDATES, "train_freq", 1)
     assert main(["demo", "--out", str(tmp_path), "--timesteps", "1", "--threads", "1"]) == 2
     assert "train for more steps" in capsys.readouterr().err
 
