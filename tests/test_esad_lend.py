@@ -404,6 +404,14 @@ def test_random_steps_of_a_second_training_are_not_predicted() -> None:
     assert model.penalty.episodes.recent["predictions"] == before > 0
 
 
+def test_no_updates_leave_everything_as_it_was() -> None:
+    model = make_model().learn(24)
+    n_updates, before = model._n_updates, th.nn.utils.parameters_to_vector(model.policy.parameters())
+    model.train(0)
+    after = th.nn.utils.parameters_to_vector(model.policy.parameters())
+    assert model._n_updates == n_updates and th.equal(before, after)
+
+
 def test_as_many_updates_as_steps() -> None:
     env = make_vec_env(CountingEnv, n_envs=2)
     model = make_model(env, learning_starts=0, train_freq=3, gradient_steps=-1)

@@ -6,6 +6,7 @@ import gymnasium as gym
 import numpy as np
 import pytest
 from gymnasium import spaces
+from scipy.stats import binom
 from stable_baselines3.common.monitor import Monitor
 
 from sb3_esad import ESADLEND
@@ -82,16 +83,17 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         },
         seed=seed,
         device="cpu",
-    ).learn(2000)
+    ).learn(1000)
 
 
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])
 def test_a_limit_makes_it_take_the_long_road(chance: float, seed: int) -> None:
-    model = learn(0.2, chance, seed)
+    limit = 0.2 * chance  # allows the short road in a fifth of the episodes; with two fifths the best action is nearly a tie
+    model = learn(limit, chance, seed)
     reward, _, cost = evaluate_policy(model, make_env(chance), 10)
     assert (reward, cost) == (-6.0, 0.0)
     _, _, costs = evaluate_policy(model, make_env(chance), 20, deterministic=False, return_episode_rewards=True)
-    assert np.sum(costs) <= 8, "more than 8 of 20 would be seen in 1 % of cases under the limit"
+    assert np.sum(costs) <= binom.ppf(0.99, 20, limit), "more would be seen in 1 % of cases under the limit"
 
 
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])

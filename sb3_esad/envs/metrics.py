@@ -198,11 +198,14 @@ def bootstrap_interval(
 
     :param values: independent, shape ``(n,)``
     :param statistic: from values to the figure
-    :return: lower and upper bound, the same for the same values
+    :return: lower and upper bound, the same for the same values; both the figure itself if there is one value only
     """
-    draws = np.random.default_rng(0).choice(values, (RESAMPLES, len(values)))
-    low, high = np.percentile([statistic(draw) for draw in draws], (2.5, 97.5))
-    return float(low), float(high)
+    from scipy.stats import bootstrap
+
+    if len(values) < 2:
+        return statistic(values), statistic(values)
+    drawn = bootstrap((values,), statistic, n_resamples=RESAMPLES, vectorized=False, method="percentile", rng=0)
+    return float(drawn.confidence_interval.low), float(drawn.confidence_interval.high)
 
 
 def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
