@@ -21,11 +21,11 @@ from sb3_esad.report import Figures, format_table, summarise_any
 from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
-TIMESTEPS, MINUTES = 12_000, 8.0
-FEW_UPDATES = {"learning_rate": FALLING_RATE, "train_freq": 16, "learning_starts": 3_000}
+TIMESTEPS, MINUTES = 20_000, 8.0
+FEW_UPDATES = {"learning_rate": FALLING_RATE, "train_freq": 32, "pretrain_steps": 100}
 """
 In hundreds of updates a rate that falls from the start moves the networks too little, and steps, which take hardly any time,
-teach more than updates: above all what a collision looks like (docs/experiments.md, section 12).
+teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13).
 """
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
