@@ -23,9 +23,10 @@ from sb3_esad.envs.config import RULES
 from sb3_esad.envs.drivers import CarFollower, RandomDriver, ReferenceDriver, SpeedKeeper
 from sb3_esad.envs.geometry import box_corners, boxes_overlap
 from sb3_esad.envs.highway import Highway
+from sb3_esad.envs.lanes import LANE_WIDTH
 from sb3_esad.envs.metrics import DrivingMetrics, summarise
-from sb3_esad.envs.roads import LANE_WIDTH
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.road_users import EGO
+from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
 from sb3_esad.envs.vehicle import Controls
 

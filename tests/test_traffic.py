@@ -6,8 +6,10 @@ from highway_env.road.road import Road as StockRoad
 from highway_env.road.road import RoadNetwork
 from highway_env.vehicle.behavior import IDMVehicle
 
-from sb3_esad.envs.roads import NO_LANE, Lane, Markings, Road, dashes
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.lanes import NO_LANE, Lane
+from sb3_esad.envs.road_users import EGO
+from sb3_esad.envs.roads import Markings, Road, dashes
+from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, Temper, User
 
 LANES, LENGTH, DT = 4, 10_000.0, 0.1
@@ -18,7 +20,9 @@ def straight_road(lanes: int = LANES, length: float = LENGTH) -> Road:
     """Parallel lanes, the leftmost at y = 0."""
     return Road(
         [
-            Lane((0.0, 4.0 * i), (length, 4.0 * i), left=i - 1 if i else NO_LANE, right=i + 1 if i < lanes - 1 else NO_LANE)
+            Lane.between(
+                (0.0, 4.0 * i), (length, 4.0 * i), left=i - 1 if i else NO_LANE, right=i + 1 if i < lanes - 1 else NO_LANE
+            )
             for i in range(lanes)
         ],
         NOTHING,
@@ -107,7 +111,7 @@ def test_cars_stop_for_what_stands_in_their_lane_and_never_reverse() -> None:
 
 
 def test_cars_look_into_the_lane_that_continues_theirs() -> None:
-    road = Road([Lane((0.0, 0.0), (100.0, 0.0), following=1), Lane((100.0, 0.0), (300.0, 0.0))], NOTHING)
+    road = Road([Lane.between((0.0, 0.0), (100.0, 0.0), following=1), Lane.between((100.0, 0.0), (300.0, 0.0))], NOTHING)
     traffic = Traffic(road, [User((150.0, 0.0), drives=False), User((40.0, 0.0), 0.0, 20.0, 20.0)])
     assert traffic.front[1] == EGO
     for _ in range(200):
@@ -145,7 +149,7 @@ def test_nobody_changes_into_a_lane_that_the_ego_vehicle_is_entering() -> None:
 
 
 def test_projection_is_exact_on_a_slanted_lane() -> None:
-    road = Road([Lane((10.0, 5.0), (10.0 + 30.0, 5.0 + 40.0))], NOTHING)
+    road = Road([Lane.between((10.0, 5.0), (10.0 + 30.0, 5.0 + 40.0))], NOTHING)
     along, across = road.project(np.array([[10.0, 5.0], [40.0, 45.0], [10.0 - 0.8, 5.0 + 0.6]]))
     np.testing.assert_allclose(along[0], [0.0, 50.0, 0.0], atol=1e-12)
     np.testing.assert_allclose(across[0], [0.0, 0.0, 1.0], atol=1e-12)

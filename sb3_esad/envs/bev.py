@@ -7,8 +7,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_esad.envs.geometry import Floats, box_corners
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Markings
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 
 Image = NDArray[np.uint8]

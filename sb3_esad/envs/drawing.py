@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs.bev import View
 from sb3_esad.envs.geometry import box_corners
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
-from sb3_esad.envs.traffic import EGO
 from sb3_esad.envs.users import Kind
 
 Image = NDArray[np.uint8]

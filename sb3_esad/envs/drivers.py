@@ -6,9 +6,9 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.roads import NO_LANE
+from sb3_esad.envs.lanes import NO_LANE
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
-from sb3_esad.envs.traffic import EGO
 
 HEADING_GAIN, LATERAL_GAIN = 2.5, 0.7  # gentler than the traffic's, for who decides 5 times a second [1/s]
 SETTLED_OFFSET, SETTLED_HEADING = 0.5, 0.05  # a lane change is over within these [m], [rad]

@@ -3,8 +3,9 @@
 import numpy as np
 
 from sb3_esad.envs.geometry import box_corners, boxes_overlap
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Ints, Road
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.traffic import Traffic
 
 
 def users_hit(traffic: Traffic) -> Ints:

@@ -5,9 +5,11 @@ from typing import Any
 
 import numpy as np
 
-from sb3_esad.envs.roads import LANE_WIDTH, NO_LANE, Lane, Markings, Road, dashes
+from sb3_esad.envs.lanes import LANE_WIDTH, NO_LANE, Lane
+from sb3_esad.envs.road_users import EGO
+from sb3_esad.envs.roads import Markings, Road, dashes
 from sb3_esad.envs.scenario import Scenario
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, Temper, User
 
 ROAD_START, ROAD_RUNOUT = -300.0, 1000.0  # the lanes go on before the start and past the end of the route [m]
@@ -28,7 +30,7 @@ def highway_road(lanes: int, route_length: float, merge: float, merge_length: fl
     """
     centres = LANE_WIDTH * np.arange(lanes + 1)
     main = [
-        Lane(
+        Lane.between(
             (ROAD_START, y),
             (route_length + ROAD_RUNOUT, y),
             left=index - 1 if index > 0 else NO_LANE,
@@ -37,8 +39,8 @@ def highway_road(lanes: int, route_length: float, merge: float, merge_length: fl
         for index, y in enumerate(centres[:-1].tolist())
     ]
     side = float(centres[-1])
-    acceleration = Lane((merge, side), (merge + merge_length, side), left=lanes - 1, on_route=False)
-    approach = Lane((merge - RAMP_LENGTH, side + RAMP_OFFSET), (merge, side), following=lanes, on_route=False)
+    acceleration = Lane.between((merge, side), (merge + merge_length, side), left=lanes - 1, on_route=False)
+    approach = Lane.between((merge - RAMP_LENGTH, side + RAMP_OFFSET), (merge, side), following=lanes, on_route=False)
     return Road([*main, acceleration, approach], _markings(lanes, route_length, merge, merge_length))
 
 

@@ -9,8 +9,10 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs.bev import BirdsEyeView, View
 from sb3_esad.envs.geometry import Floats, wrap_angle
-from sb3_esad.envs.roads import LANE_WIDTH, Road
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.lanes import LANE_WIDTH
+from sb3_esad.envs.road_users import EGO
+from sb3_esad.envs.roads import Road
+from sb3_esad.envs.traffic import Traffic
 
 SPEED_SCALE, DISTANCE_SCALE, WIDTH_SCALE = 30.0, 100.0, 16.0  # [m/s], [m], [m]
 FRAMES = ("lane", "ego")

@@ -1,4 +1,4 @@
-"""Roads as arrays of straight lanes, onto which all road users are projected at once."""
+"""Roads as arrays of lanes, onto which all road users are projected at once."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,39 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_esad.envs.geometry import Floats, wrap_angle
+from sb3_esad.envs.lanes import NO_LANE, Lane
 
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 
-CAR_LENGTH = 5.0
-NO_LANE = -1
-LANE_WIDTH = 4.0
 DASH_LENGTH, DASH_PERIOD = 8.0, 20.0  # [m]
-
-
-@dataclass(frozen=True)
-class Lane:
-    """
-    One straight lane and its place among the others.
-
-    :param start: first point of the centre line [m]
-    :param end: last point of the centre line [m]
-    :param left: index of the lane one may change to on the left, ``NO_LANE`` if there is none
-    :param right: the same on the right
-    :param following: index of the lane that continues this one, ``NO_LANE`` if it just ends
-    :param on_route: whether the ego vehicle's route leads along this lane
-    :param speed_limit: [m/s]
-    :param width: [m]
-    """
-
-    start: tuple[float, float]
-    end: tuple[float, float]
-    left: int = NO_LANE
-    right: int = NO_LANE
-    following: int = NO_LANE
-    on_route: bool = True
-    speed_limit: float = 30.0
-    width: float = LANE_WIDTH
 
 
 @dataclass(frozen=True)
@@ -70,21 +43,29 @@ class Road:
     def __init__(self, lanes: Sequence[Lane], markings: Markings) -> None:
         self.markings = markings
         self.start = np.array([lane.start for lane in lanes], dtype=np.float64)
-        span = np.array([lane.end for lane in lanes], dtype=np.float64) - self.start
-        self.length = np.hypot(span[:, 0], span[:, 1])
-        self.direction = span / self.length[:, None]
-        self.heading = np.arctan2(span[:, 1], span[:, 0])
+        self.heading = np.array([lane.heading for lane in lanes], dtype=np.float64)
+        self.length = np.array([lane.length for lane in lanes], dtype=np.float64)
+        self.curvature = np.array([lane.curvature for lane in lanes], dtype=np.float64)
+        self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], -1)
         self.width = np.array([lane.width for lane in lanes])
         self.speed_limit = np.array([lane.speed_limit for lane in lanes])
         self.left = np.array([lane.left for lane in lanes])
         self.right = np.array([lane.right for lane in lanes])
         self.following = np.array([lane.following for lane in lanes])
-        self.continued = np.flatnonzero(self.following != NO_LANE)
         self.on_route = np.array([lane.on_route for lane in lanes])
+        self._describe_arcs()
+
+    def _describe_arcs(self) -> None:
+        self.arcs = arcs = np.flatnonzero(self.curvature)
+        curvature, heading = self.curvature[arcs], self.heading[arcs]
+        self._sense, self._radius = np.sign(curvature)[:, None], 1 / np.abs(curvature)[:, None]
+        self._centre = self.start[arcs] + np.stack([-np.sin(heading), np.cos(heading)], -1) / curvature[:, None]
+        middle = heading + curvature * self.length[arcs] / 2
+        self._middle = (middle - np.sign(curvature) * np.pi / 2)[:, None]  # direction from the centre to the arc's middle
 
     def project(self, position: Floats) -> tuple[Floats, Floats]:
         """
-        Coordinates of points along and across every lane.
+        Coordinates of points along and across every lane; straight lanes go on beyond their ends, arcs as circles.
 
         :param position: points, shape ``(n, 2)`` [m]
         :return: distance along the lane from its start, and to the right of its centre, each ``(lanes, n)`` [m]
@@ -92,7 +73,26 @@ class Road:
         x = position[:, 0] - self.start[:, :1]
         y = position[:, 1] - self.start[:, 1:]
         cos, sin = self.direction[:, :1], self.direction[:, 1:]
-        return x * cos + y * sin, y * cos - x * sin
+        along, across = x * cos + y * sin, y * cos - x * sin
+        if self.arcs.size:
+            along[self.arcs], across[self.arcs] = self._project_onto_arcs(position)
+        return along, across
+
+    def _project_onto_arcs(self, position: Floats) -> tuple[Floats, Floats]:
+        x, y = position[:, 0] - self._centre[:, :1], position[:, 1] - self._centre[:, 1:]
+        turned = wrap_angle(np.arctan2(y, x) - self._middle) * self._sense
+        along = self.length[self.arcs, None] / 2 + turned * self._radius
+        return along, (self._radius - np.hypot(x, y)) * self._sense
+
+    def heading_at(self, lanes: Ints, along: Floats) -> Floats:
+        """
+        Direction of lanes.
+
+        :param lanes: indices, shape ``(n,)``
+        :param along: distance from the start of each [m]
+        :return: not wrapped, shape ``(n,)`` [rad]
+        """
+        return self.heading[lanes] + self.curvature[lanes] * along
 
     def position(self, lane: int, along: float, across: float = 0.0) -> Floats:
         """
@@ -103,8 +103,12 @@ class Road:
         :param across: distance to the right of its centre [m]
         :return: the point, shape ``(2,)`` [m]
         """
-        cos, sin = self.direction[lane]
-        return np.asarray(self.start[lane] + along * self.direction[lane] + across * np.array([-sin, cos]))
+        curvature, heading = self.curvature[lane], self.heading[lane]
+        turned = heading + curvature * along
+        chord = along * np.sinc(curvature * along / (2 * np.pi))
+        middle = heading + curvature * along / 2
+        forward = chord * np.array([np.cos(middle), np.sin(middle)])
+        return np.asarray(self.start[lane] + forward + across * np.array([-np.sin(turned), np.cos(turned)]))
 
     def overshoot(self, along: Floats) -> Floats:
         """
@@ -124,7 +128,7 @@ class Road:
         :param heading: of the users, shape ``(n,)`` [rad]
         :return: lane indices, shape ``(n,)``
         """
-        turn = np.abs(wrap_angle(heading - self.heading[:, None]))
+        turn = np.abs(wrap_angle(heading - self.heading[:, None] - self.curvature[:, None] * along))
         return np.asarray(np.argmin(np.abs(across) + self.overshoot(along) + turn, axis=0))
 
     def contains(self, position: Floats) -> Bools:

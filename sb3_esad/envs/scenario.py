@@ -15,8 +15,9 @@ from sb3_esad.envs.geometry import wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
-from sb3_esad.envs.traffic import EGO, Traffic
+from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 from sb3_esad.envs.vehicle import Controls
 
@@ -135,7 +136,10 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     @property
     def heading_error(self) -> float:
         """Angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
-        return float(wrap_angle(self.traffic.heading[EGO] - self.road.heading[self.traffic.lane[EGO]]))
+        traffic = self.traffic
+        lane = traffic.lane[:1]
+        along_lane = self.road.heading_at(lane, traffic.along[lane, EGO])
+        return float(wrap_angle(traffic.heading[EGO] - along_lane)[0])
 
     @property
     def remaining(self) -> float:

@@ -1,4 +1,4 @@
-"""All road users as arrays; cars follow (IDM) and change lane (MOBIL) as in highway-env, one NumPy call for all."""
+"""Cars follow (IDM) and change lane (MOBIL) as in highway-env, one NumPy call for all."""
 
 from collections.abc import Sequence
 from dataclasses import fields
@@ -6,16 +6,15 @@ from dataclasses import fields
 import numpy as np
 
 from sb3_esad.envs.geometry import Floats, wrap_angle
-from sb3_esad.envs.roads import CAR_LENGTH, NO_LANE, Bools, Ints, Road
+from sb3_esad.envs.lanes import CAR_LENGTH, NO_LANE
+from sb3_esad.envs.road_users import RoadUsers
+from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Temper, User
 
-EGO = 0  # row of the ego vehicle in every array
 HEADING_GAIN, LATERAL_GAIN = 1 / 0.2, 1 / 0.6  # [1/s]
 MAX_WHEEL_ANGLE, MAX_APPROACH_ANGLE = np.pi / 3, np.pi / 4  # [rad]
 MAX_ACCELERATION = 6.0  # [m/s^2]
-TOP_SPEED = 40.0  # [m/s]
-LANE_MARGIN = 1.0  # a car this far past the line still counts as being in the lane [m]
-INTENTION_HORIZON = 1.5  # others read where the ego vehicle is going from where it will be after this time [s]
+PURSUIT = 0.1  # cars take the direction that their lane will have after this time [s]
 
 
 def not_zero(value: Floats) -> Floats:
@@ -28,88 +27,26 @@ def bounded(value: Floats, limit: float) -> Floats:
     return np.minimum(np.maximum(value, -limit), limit)
 
 
-class Traffic:
+class Traffic(RoadUsers):
     """
-    Road users on a road, row ``EGO`` being the ego vehicle.
+    Road users of whom some drive themselves.
 
     :meth:`act` lets every self-driving car choose, on the same snapshot, its acceleration and wheel angle; :meth:`move`
-    carries all users forward. Positions are projected onto the lanes once per move. Sources: Treiber et al., 2000 (IDM);
-    Kesting et al., 2007 (MOBIL); on straight lanes the behaviour is that of ``highway_env.vehicle.behavior.IDMVehicle``,
-    save that cars never reverse and look ahead into the lane that continues theirs.
+    carries all users forward. Sources: Treiber et al., 2000 (IDM); Kesting et al., 2007 (MOBIL); the behaviour is that of
+    ``highway_env.vehicle.behavior.IDMVehicle``, save that cars never reverse and look into the lanes that continue theirs.
 
     :param road: the lanes
     :param users: who is there at the start, the ego vehicle first
     """
 
     def __init__(self, road: Road, users: Sequence[User]) -> None:
-        self.road = road
-        self.position = np.array([user.position for user in users], dtype=np.float64)
-        self.heading = np.array([user.heading for user in users], dtype=np.float64)
-        self.speed = np.array([user.speed for user in users], dtype=np.float64)
         self.target_speed = np.array([user.target_speed for user in users], dtype=np.float64)
-        self.size = np.array([user.size for user in users], dtype=np.float64)
-        self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
-        self.kind = np.array([user.kind for user in users], dtype=np.int64)
-        self.drivers = np.flatnonzero([user.drives for user in users])
         self.timer = np.array([user.timer for user in users], dtype=np.float64)
         self.temper = {f.name: np.array([getattr(user.temper, f.name) for user in users]) for f in fields(Temper)}
         own = self.temper
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
         self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking])
-        self.acceleration = np.zeros(len(users))
-        self.wheel_angle = np.zeros(len(users))
-        self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
-        self.target_lane = np.zeros(len(users), dtype=np.int64)
-        self._locate()
-        self.target_lane[:] = self.lane
-
-    def _locate(self) -> None:
-        road, count = self.road, len(self.speed)
-        self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], -1)
-        self.velocity = self.speed[:, None] * self.direction
-        soon = self.position[self.outsiders] + INTENTION_HORIZON * self.velocity[self.outsiders]
-        along, across = road.project(np.concatenate([self.position, soon]))
-        lane = road.closest_lane(along, across, np.concatenate([self.heading, self.heading[self.outsiders]]))
-        self.along, self.across = along[:, :count], across[:, :count]
-        self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
-        self._look_around()
-
-    def _look_around(self) -> None:
-        """Find out who is in which lane and who follows whom."""
-        road = self.road
-        within = np.abs(self.across) <= road.width[:, None] / 2 + LANE_MARGIN
-        self.present = within & (road.overshoot(self.along) <= CAR_LENGTH)
-        self.reach = self.along
-        if road.continued.size:
-            self.reach = self.along.copy()
-            self._look_ahead(road.continued)
-        # Others make room for a user that they do not steer in the lane where it will soon be, too.
-        self.present[self.target_lane[self.outsiders], self.outsiders] = True
-        self.front, self.rear = self.neighbours(np.arange(len(self.lane)), self.lane)
-
-    def _look_ahead(self, lanes: Ints) -> None:
-        """Count who is in the lane that continues one as being on that one, past its end."""
-        following = self.road.following[lanes]
-        continued = self.present[following] & ~self.present[lanes]
-        beyond = self.along[following] + self.road.length[lanes, None]
-        self.reach[lanes] = np.where(continued, beyond, self.along[lanes])
-        self.present[lanes] |= continued
-
-    def neighbours(self, rows: Ints, lanes: Ints) -> tuple[Ints, Ints]:
-        """
-        Nearest user ahead of and behind each of some users, on given lanes.
-
-        :param rows: users, shape ``(n,)``
-        :param lanes: the lane to look at for each of them, shape ``(n,)``
-        :return: rows of those ahead and of those behind, each ``(n,)``, -1 where there is nobody
-        """
-        gap = self.reach[lanes] - self.reach[lanes, rows][:, None]
-        gap[~self.present[lanes]] = np.nan
-        order = np.arange(len(rows))
-        gap[order, rows] = np.nan
-        ahead, behind = np.where(gap >= 0, gap, np.inf), np.where(gap < 0, gap, -np.inf)
-        front, rear = ahead.argmin(1), behind.argmax(1)
-        return np.where(ahead[order, front] < np.inf, front, -1), np.where(behind[order, rear] > -np.inf, rear, -1)
+        super().__init__(road, users)
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
         """
@@ -123,7 +60,7 @@ class Traffic:
         acceleration, exponent, gap, headway, braking = self._following[:, judges]
         lane, speed = self.lane[rows], self.speed[rows]
         desired = not_zero(np.minimum(self.target_speed[rows], self.road.speed_limit[lane]))
-        distance = not_zero(self.reach[lane, front] - self.reach[lane, rows])
+        distance = not_zero(self.distance(rows, front))
         closing = np.einsum("nd,nd->n", self.velocity[rows] - self.velocity[front], self.direction[rows])
         wanted = gap + speed * headway + speed * closing / braking
         crowding = (front >= 0) * (wanted / distance) ** 2
@@ -161,7 +98,8 @@ class Traffic:
         """
         speed = not_zero(self.speed[rows])
         approach = np.arcsin(bounded(-lateral_gain * self.across[lanes, rows] / speed, 1.0))
-        wanted = self.road.heading[lanes] + bounded(approach, MAX_APPROACH_ANGLE)
+        ahead = self.road.heading_at(lanes, self.along[lanes, rows] + PURSUIT * self.speed[rows])
+        wanted = ahead + bounded(approach, MAX_APPROACH_ANGLE)
         yaw_rate = heading_gain * wrap_angle(wanted - self.heading[rows])
         slip = np.arcsin(bounded(self.size[rows, 0] / 2 / speed * yaw_rate, 1.0))
         return bounded(np.arctan(2 * np.tan(slip)), MAX_WHEEL_ANGLE)
@@ -184,7 +122,7 @@ class Traffic:
     def _continue_lanes(self, rows: Ints) -> None:
         target = self.target_lane[rows]
         done = self.along[target, rows] > self.road.length[target] - CAR_LENGTH / 2
-        following = self.road.following[target]
+        following = self.next_lane[rows, target]
         self.target_lane[rows] = np.where(done & (following != NO_LANE), following, target)
 
     def _choose_lanes(self, rows: Ints) -> None:
@@ -225,25 +163,13 @@ class Traffic:
         """
         rivals = np.flatnonzero((aims == lane) & (self.lane != lane))
         rivals = rivals[rivals != row]
-        distance = self.reach[self.lane[row], rivals] - self.reach[self.lane[row], row]
+        distance = self.distance(np.full_like(rivals, row), rivals)
         closing = (self.velocity[row] - self.velocity[rivals]) @ self.direction[row]
         _, _, gap, headway, braking = self._following[:, row]
         wanted = gap + self.speed[row] * headway + self.speed[row] * closing / braking
         return bool(np.any((distance > 0) & (distance < wanted)))
 
     def move(self, dt: float) -> None:
-        """
-        Move every user by its acceleration and wheel angle: a kinematic bicycle with its axles at the ends.
-
-        :param dt: time step [s]
-        """
-        slip = np.arctan(0.5 * np.tan(self.wheel_angle))
-        course = self.heading + slip
-        self.position[:, 0] += self.speed * np.cos(course) * dt
-        self.position[:, 1] += self.speed * np.sin(course) * dt
-        self.heading += self.speed * np.sin(slip) / (self.size[:, 0] / 2) * dt
-        slowing = np.minimum(self.acceleration, TOP_SPEED - self.speed)
-        acceleration = np.where(self.speed > TOP_SPEED, slowing, self.acceleration)
-        self.speed = np.maximum(self.speed + acceleration * dt, 0.0)
+        """See :meth:`RoadUsers.move`."""
         self.timer += dt
-        self._locate()
+        super().move(dt)

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, field
 from enum import IntEnum
 
-from sb3_esad.envs.roads import CAR_LENGTH
+from sb3_esad.envs.lanes import CAR_LENGTH
 
 CAR_WIDTH = 2.0
 
@@ -57,6 +57,7 @@ class User:
     :param size: length and width [m]
     :param temper: how it drives
     :param timer: time since it last thought about changing lane [s]
+    :param path: indices of lanes that it takes one after the other; elsewhere it takes the lane that continues its own
     """
 
     position: tuple[float, float]
@@ -68,3 +69,4 @@ class User:
     size: tuple[float, float] = (CAR_LENGTH, CAR_WIDTH)
     temper: Temper = field(default_factory=Temper)
     timer: float = 0.0
+    path: tuple[int, ...] = ()

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.roads import CAR_LENGTH
+from sb3_esad.envs.lanes import CAR_LENGTH
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,130 @@
+"""All road users as arrays: their bodies, how they move, and where they are on the lanes."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_esad.envs.geometry import Floats
+from sb3_esad.envs.lanes import CAR_LENGTH, NO_LANE
+from sb3_esad.envs.roads import Bools, Ints, Road
+from sb3_esad.envs.users import User
+
+EGO = 0  # row of the ego vehicle in every array
+TOP_SPEED = 40.0  # [m/s]
+LANE_MARGIN = 1.0  # a car this far past the line still counts as being in the lane [m]
+INTENTION_HORIZON = 1.5  # others read where the ego vehicle is going from where it will be after this time [s]
+LOOKAHEAD = 3  # lanes that are looked into beyond the present one
+
+
+class RoadUsers:
+    """
+    Road users on a road, row ``EGO`` being the ego vehicle; positions are projected onto the lanes once per move.
+
+    :param road: the lanes
+    :param users: who is there at the start, the ego vehicle first
+    """
+
+    def __init__(self, road: Road, users: Sequence[User]) -> None:
+        self.road = road
+        self.position = np.array([user.position for user in users], dtype=np.float64)
+        self.heading = np.array([user.heading for user in users], dtype=np.float64)
+        self.speed = np.array([user.speed for user in users], dtype=np.float64)
+        self.size = np.array([user.size for user in users], dtype=np.float64)
+        self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
+        self.kind = np.array([user.kind for user in users], dtype=np.int64)
+        self.drivers = np.flatnonzero([user.drives for user in users])
+        self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
+        self.acceleration = np.zeros(len(users))
+        self.wheel_angle = np.zeros(len(users))
+        self.next_lane = self._follow_paths(users)
+        self._rows = np.arange(len(users))
+        self._lookahead = LOOKAHEAD if (self.next_lane != NO_LANE).any() else 0
+        self.target_lane = np.zeros(len(users), dtype=np.int64)
+        self._locate()
+        self.target_lane[:] = self.lane
+
+    def _follow_paths(self, users: Sequence[User]) -> Ints:
+        """The lane that each user takes after each lane, shape ``(users, lanes)``."""
+        following = np.tile(self.road.following, (len(users), 1))
+        for row, user in enumerate(users):
+            following[row, list(user.path[:-1])] = user.path[1:]
+        return following
+
+    def _locate(self) -> None:
+        road, count = self.road, len(self.speed)
+        self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], -1)
+        self.velocity = self.speed[:, None] * self.direction
+        soon = self.position[self.outsiders] + INTENTION_HORIZON * self.velocity[self.outsiders]
+        along, across = road.project(np.concatenate([self.position, soon]))
+        lane = road.closest_lane(along, across, np.concatenate([self.heading, self.heading[self.outsiders]]))
+        self.along, self.across = along[:, :count], across[:, :count]
+        self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
+        within = np.abs(self.across) <= road.width[:, None] / 2 + LANE_MARGIN
+        self.present = within & (road.overshoot(self.along) <= CAR_LENGTH)
+        # Others make room for a user that they do not steer in the lane where it will soon be, too.
+        self.present[self.target_lane[self.outsiders], self.outsiders] = True
+        self.reach, there = self.look_ahead(self._rows, self.lane)
+        self.front, self.rear = self._nearest(self._rows, self.reach, there)
+
+    def look_ahead(self, rows: Ints, lanes: Ints) -> tuple[Floats, Bools]:
+        """
+        Place everybody along given lanes and those that some users take after them.
+
+        :param rows: users, shape ``(n,)``
+        :param lanes: the lane to look at for each of them, shape ``(n,)``
+        :return: distance of every user from the start of the lane, by its projection onto it if it is on none of them [m]; and
+            whether it is on one of them; each ``(n, users)``
+        """
+        place, there = self.along[lanes], self.present[lanes]
+        passed = np.zeros(len(rows))
+        for _ in range(self._lookahead):
+            passed, lanes = passed + self.road.length[lanes], np.where(lanes == NO_LANE, NO_LANE, self.next_lane[rows, lanes])
+            beyond = self.present[lanes] & ~there & (lanes != NO_LANE)[:, None]
+            place, there = np.where(beyond, passed[:, None] + self.along[lanes], place), there | beyond
+        return place, there
+
+    def neighbours(self, rows: Ints, lanes: Ints) -> tuple[Ints, Ints]:
+        """
+        Nearest user ahead of and behind each of some users, on given lanes.
+
+        :param rows: users, shape ``(n,)``
+        :param lanes: the lane to look at for each of them, shape ``(n,)``
+        :return: rows of those ahead and of those behind, each ``(n,)``, -1 where there is nobody
+        """
+        return self._nearest(rows, *self.look_ahead(rows, lanes))
+
+    @staticmethod
+    def _nearest(rows: Ints, place: Floats, there: Bools) -> tuple[Ints, Ints]:
+        order = np.arange(len(rows))
+        gap = place - place[order, rows][:, None]
+        gap[~there] = np.nan
+        gap[order, rows] = np.nan
+        ahead, behind = np.where(gap >= 0, gap, np.inf), np.where(gap < 0, gap, -np.inf)
+        front, rear = ahead.argmin(1), behind.argmax(1)
+        return np.where(ahead[order, front] < np.inf, front, -1), np.where(behind[order, rear] > -np.inf, rear, -1)
+
+    def distance(self, rows: Ints, others: Ints) -> Floats:
+        """
+        How far others are ahead, along the lanes that users take.
+
+        :param rows: users, shape ``(n,)``
+        :param others: shape ``(n,)``
+        :return: negative behind, shape ``(n,)`` [m]
+        """
+        return self.reach[rows, others] - self.reach[rows, rows]
+
+    def move(self, dt: float) -> None:
+        """
+        Move every user by its acceleration and wheel angle: a kinematic bicycle with its axles at the ends.
+
+        :param dt: time step [s]
+        """
+        slip = np.arctan(0.5 * np.tan(self.wheel_angle))
+        course = self.heading + slip
+        self.position[:, 0] += self.speed * np.cos(course) * dt
+        self.position[:, 1] += self.speed * np.sin(course) * dt
+        self.heading += self.speed * np.sin(slip) / (self.size[:, 0] / 2) * dt
+        slowing = np.minimum(self.acceleration, TOP_SPEED - self.speed)
+        acceleration = np.where(self.speed > TOP_SPEED, slowing, self.acceleration)
+        self.speed = np.maximum(self.speed + acceleration * dt, 0.0)
+        self._locate()
