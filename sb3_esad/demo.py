@@ -22,7 +22,7 @@ from sb3_esad.video import record_model
 
 ENV_ID = "esad-highway-v0"
 TIMESTEPS, MINUTES = 20_000, 8.0
-FEW_UPDATES = {"learning_rate": FALLING_RATE, "train_freq": 32, "pretrain_steps": 100}
+FEW_UPDATES = {"learning_rate": FALLING_RATE, "train_freq": 32, "learning_starts": 3_000, "pretrain_gradient_steps": 0}
 """
 In hundreds of updates a rate that falls from the start moves the networks too little, and steps, which take hardly any time,
 teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13).

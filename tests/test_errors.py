@@ -82,6 +82,7 @@ def test_missing_costs_are_zero_with_one_warning() -> None:
         ("tau", 0.0, "(0, 1]"),
         ("batch_size", 0, ">= 1"),
         ("pretrain_steps", -1, ">= 0"),
+        ("pretrain_gradient_steps", -1, ">= 0"),
         ("imagination_horizon", 0, ">= 1"),
         ("imagination_starts", 1, ">= 2"),
         ("random_hold", 0, ">= 1"),

@@ -433,6 +433,10 @@ def test_pretraining_comes_once(monkeypatch: pytest.MonkeyPatch) -> None:
     assert updates == [0] * 6 + [1, 2]
 
 
+def test_additional_updates_come_once() -> None:
+    assert make_model(pretrain_gradient_steps=4, learning_starts=8).learn(20)._n_updates == 4 + 3
+
+
 @pytest.mark.parametrize("n_envs", [1, 2])
 @pytest.mark.parametrize("noisy", [False, True])
 def test_executed_actions_are_remembered(n_envs: int, noisy: bool) -> None:

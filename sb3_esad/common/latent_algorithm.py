@@ -37,6 +37,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     :param learning_rate: of all networks, a number or a function of the remaining progress; 0.006 by default, which
         falls to 0 in the second half of the training
     :param pretrain_steps: updates of the world model alone, before the first update of the behaviour
+    :param pretrain_gradient_steps: additional updates of model and behaviour when learning starts
     :param imagination_horizon: H, imagined steps
     :param imagination_starts: number of imagined trajectories in an update
     :param lambda_return: mixing of n-step returns, in [0, 1]
@@ -57,6 +58,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         env: GymEnv | str,
         learning_rate: float | Schedule = FALLING_RATE,
         pretrain_steps: int = 100,
+        pretrain_gradient_steps: int = 0,
         imagination_horizon: int = 10,
         imagination_starts: int = 48,
         lambda_return: float = 0.95,
@@ -66,6 +68,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     ) -> None:
         super().__init__(policy, env, learning_rate, _init_setup_model=False, **kwargs)
         self.pretrain_steps = pretrain_steps
+        self.pretrain_gradient_steps = pretrain_gradient_steps
         self.imagination_horizon = imagination_horizon
         self.imagination_starts = imagination_starts
         self.lambda_return = lambda_return
@@ -76,7 +79,8 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         require(0 <= self.lambda_return <= 1, "lambda_return", self.lambda_return, "a number in [0, 1]")
-        require(self.pretrain_steps >= 0, "pretrain_steps", self.pretrain_steps, "a number of updates >= 0")
+        for name in ("pretrain_steps", "pretrain_gradient_steps"):
+            require(getattr(self, name) >= 0, name, getattr(self, name), "a number of updates >= 0")
         require(self.imagination_horizon >= 1, "imagination_horizon", self.imagination_horizon, "a number of steps >= 1")
         require(self.imagination_starts >= 2, "imagination_starts", self.imagination_starts, "a number of trajectories >= 2")
         require(self.max_grad_norm > 0, "max_grad_norm", self.max_grad_norm, "a bound > 0")
@@ -115,8 +119,10 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
             return
         self.policy.set_training_mode(True)
         self._update_learning_rate(list(self._optimizers().values()))
-        for _ in range(self.pretrain_steps if self._n_updates == 0 else 0):
-            self._update_world_model(self._sample(batch_size))
+        if self._n_updates == 0:
+            gradient_steps += self.pretrain_gradient_steps
+            for _ in range(self.pretrain_steps):
+                self._update_world_model(self._sample(batch_size))
         logs: dict[str, list[float]] = defaultdict(list)
         for update_logs in self._updates(gradient_steps, batch_size):
             for name, value in update_logs.items():
