@@ -5,15 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from sb3_esad.envs.lanes import LANE_WIDTH, NO_LANE, Lane
+from sb3_esad.envs.lanes import LANE_WIDTH, Lane
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Markings, Road, dashes
-from sb3_esad.envs.scenario import Scenario
-from sb3_esad.envs.traffic import Traffic
-from sb3_esad.envs.users import Kind, Temper, User
+from sb3_esad.envs.straight import ROAD_START, StraightDrive, parallel_lanes
+from sb3_esad.envs.users import Kind, User
 
-ROAD_START, ROAD_RUNOUT = -300.0, 1000.0  # the lanes go on before the start and past the end of the route [m]
-EGO_TEMPER = Temper(headway=0.9, gap=8.0, imposed_braking=3.0, gain=0.1)  # how scripted drivers drive the ego vehicle
 MERGING_TEMPER = {"politeness": 0.0, "gain": 0.0, "imposed_braking": 4.0, "delay": 0.4}  # their lane ends
 RAMP_LENGTH, RAMP_OFFSET = 350.0, 20.0  # the approach starts this far before the merge, and this far to its right [m]
 
@@ -28,19 +25,10 @@ def highway_road(lanes: int, route_length: float, merge: float, merge_length: fl
     :param merge_length: of the acceleration lane [m]
     :return: lanes from left to right, then the acceleration lane, then the ramp's approach
     """
-    centres = LANE_WIDTH * np.arange(lanes + 1)
-    main = [
-        Lane.between(
-            (ROAD_START, y),
-            (route_length + ROAD_RUNOUT, y),
-            left=index - 1 if index > 0 else NO_LANE,
-            right=index + 1 if index < lanes - 1 else NO_LANE,
-        )
-        for index, y in enumerate(centres[:-1].tolist())
-    ]
-    side = float(centres[-1])
+    side = lanes * LANE_WIDTH
     acceleration = Lane.between((merge, side), (merge + merge_length, side), left=lanes - 1, on_route=False)
     approach = Lane.between((merge - RAMP_LENGTH, side + RAMP_OFFSET), (merge, side), following=lanes, on_route=False)
+    main = parallel_lanes(lanes, route_length)
     return Road([*main, acceleration, approach], _markings(lanes, route_length, merge, merge_length))
 
 
@@ -68,7 +56,7 @@ def _markings(lanes: int, route_length: float, merge: float, merge_length: float
     return Markings(np.array(asphalt), np.array([False, False, True]), np.concatenate([dashed, np.array(solid)]), is_dash)
 
 
-class Highway(Scenario):
+class Highway(StraightDrive):
     """Drive 600 m at 25 m/s through slower traffic on three or four lanes, past an on-ramp. See :class:`Scenario`."""
 
     @classmethod
@@ -76,18 +64,6 @@ class Highway(Scenario):
         """See :meth:`Scenario.default_config`."""
         return {
             **super().default_config(),
-            "route_length": 600.0,
-            "lane_counts": (3, 4),
-            "start_speed": (22.0, 25.0),
-            "traffic_behind": 110.0,
-            "traffic_ahead": 300.0,
-            "headway": (1.1, 3.1),
-            "desired_speed": (21.5, 25.0),
-            "desired_speed_spread": 1.5,
-            "slow_share": 0.12,
-            "slow_speed": (15.0, 18.0),
-            "fast_share": 0.1,
-            "fast_speed": (26.0, 29.0),
             "merging_cars": 3,
             "merge_start": (150.0, 330.0),
             "merge_length": 180.0,
@@ -104,68 +80,21 @@ class Highway(Scenario):
         self.merge = float(self.np_random.uniform(*config["merge_start"]))
         return highway_road(self.lanes, self.route_length, self.merge, config["merge_length"])
 
-    def _make_traffic(self) -> Traffic:
-        own_lane = int(self.np_random.integers(self.lanes))
-        speed = float(self.np_random.uniform(*self.config["start_speed"]))
-        place, target = (0.0, own_lane * LANE_WIDTH), self.config["target_speed"]
-        ego = User(place, speed=speed, target_speed=target, drives=False, temper=EGO_TEMPER)
-        cars = [car for lane in range(self.lanes) for car in self._lane_traffic(lane, lane == own_lane)]
-        barrier = User(tuple(self.road.end(self.lanes)), kind=Kind.STATIC, drives=False, size=(1.0, 3.0))
+    def _others(self) -> list[User]:
         self._draw_slowdown()
-        return Traffic(self.road, [ego, *cars, *self._merging_cars(), barrier])
-
-    def _lane_traffic(self, lane: int, own: bool) -> list[User]:
-        """Cars of one lane, front to back; a gap is kept free around the ego vehicle in its own lane."""
-        config, random = self.config, self.np_random
-        cars: list[User] = []
-        x, ahead = config["traffic_ahead"] - random.uniform(0.0, 40.0), config["max_speed"]
-        clear = (-40.0, 45.0) if own else (0.0, 0.0)
-        while x > -config["traffic_behind"]:
-            desired = self._desired_speed(lane)
-            if not clear[0] < x < clear[1]:
-                speed = min(desired, ahead + 1.0)
-                cars.append(self._car(lane, x - ROAD_START, speed, desired, self._temper()))
-                ahead = speed
-            x -= 5.0 + desired * random.uniform(*config["headway"])
-        return cars
-
-    def _desired_speed(self, lane: int) -> float:
-        """Right lanes are slower; some cars, anywhere, are much slower or faster than the rest."""
-        config, random = self.config, self.np_random
-        draw = random.random()
-        if draw < config["slow_share"]:
-            return float(random.uniform(*config["slow_speed"]))
-        if draw > 1.0 - config["fast_share"]:
-            return float(random.uniform(*config["fast_speed"]))
-        slow, fast = config["desired_speed"]
-        mean = fast - (fast - slow) * lane / max(self.lanes - 1, 1)
-        return float(mean + random.uniform(-1.0, 1.0) * config["desired_speed_spread"])
-
-    def _temper(self) -> Temper:
-        random = self.np_random
-        return Temper(
-            acceleration=float(random.uniform(2.0, 3.5)),
-            gap=float(random.uniform(7.5, 9.5)),
-            headway=float(random.uniform(0.7, 1.4)),
-            exponent=float(random.uniform(3.5, 4.5)),
-            politeness=float(random.uniform(0.0, 0.5)),
-        )
-
-    def _car(self, lane: int, along: float, speed: float, desired: float, temper: Temper) -> User:
-        x, y = self.road.position(lane, along).tolist()
-        timer = float(self.np_random.uniform(0.0, temper.delay))
-        return User((x, y), float(self.road.heading[lane]), speed, desired, temper=temper, timer=timer)
+        barrier = User(tuple(self.road.end(self.lanes)), kind=Kind.STATIC, drives=False, size=(1.0, 3.0))
+        return [*self._merging_cars(), barrier]
 
     def _merging_cars(self) -> list[User]:
         """Cars on the ramp, timed to reach the acceleration lane about when the ego vehicle does."""
-        random, lane = self.np_random, self.lanes + 1
+        random, population, lane = self.np_random, self.population, self.lanes + 1
         speed = float(random.uniform(19.0, 22.0))
         along = RAMP_LENGTH - self.merge * speed / self.config["target_speed"] + float(random.uniform(0.0, 80.0))
         cars = []
         for _ in range(self.config["merging_cars"]):
             desired = speed + float(random.uniform(0.0, 3.0))
             if 0.0 <= along <= RAMP_LENGTH:
-                cars.append(self._car(lane, along, speed, desired, replace(self._temper(), **MERGING_TEMPER)))
+                cars.append(population.car(lane, along, speed, desired, replace(population.temper(), **MERGING_TEMPER)))
             along -= speed * float(random.uniform(1.8, 3.0))
         return cars
 
@@ -186,6 +115,3 @@ class Highway(Scenario):
             row, speed = self._slowed
             traffic.target_speed[row] = speed
             self._slowed, self._slowdown_start = None, np.inf
-
-    def _progress(self) -> float:
-        return float(self.traffic.position[EGO, 0])

@@ -1,6 +1,10 @@
-"""The named terms of the reward (the paper's section "Design of the Reward Function"), as pure functions."""
+"""The named terms of the reward (the paper's section "Design of the Reward Function"): pure functions, and their sum."""
 
 import math
+from collections import Counter
+from typing import Any
+
+REGION_LENGTH = 20.0  # [m]
 
 
 def velocity_reward(speed: float, target_speed: float, sharpness: float) -> float:
@@ -63,3 +67,51 @@ def progress_share(speed: float, target_speed: float) -> float:
     :return: 0 at rest, 1 from the target speed on
     """
     return min(max(speed, 0.0) / target_speed, 1.0)
+
+
+class DrivingReward:
+    """
+    The terms of one step, and their weighted sum.
+
+    :param config: of the scenario; reads the weights, sharpnesses, tolerance and decay
+    """
+
+    def __init__(self, config: dict[str, Any]) -> None:
+        self._config = config
+        self._visits: Counter[tuple[int, int]] = Counter()
+
+    def forget(self) -> None:
+        """Count the visits of regions anew."""
+        self._visits.clear()
+
+    def terms(self, speed: float, error: float, lane: int, offset: float, progress: float) -> dict[str, float]:
+        """
+        Judge a step.
+
+        :param speed: [m/s]
+        :param error: angle between the vehicle and its lane [rad]
+        :param lane: index of its lane
+        :param offset: distance to the centre of its lane, either sign [m]
+        :param progress: position along the route [m]
+        :return: the terms by name
+        """
+        config, target, along_route = self._config, self._config["target_speed"], speed * math.cos(error)
+        share = progress_share(along_route, target)
+        region = (lane, int(progress // REGION_LENGTH))
+        visits = self._visits[region]
+        self._visits[region] += 1
+        return {
+            "velocity": velocity_reward(along_route, target, config["velocity_sharpness"]),
+            "lane": lane_reward(offset, config["lane_tolerance"]) * share,
+            "orientation": orientation_reward(error, config["orientation_sharpness"]) * share,
+            "exploration": exploration_reward(visits, config["exploration_decay"]),
+        }
+
+    def total(self, terms: dict[str, float]) -> float:
+        """
+        Sum up.
+
+        :param terms: of a step
+        :return: the reward, 1 for a perfect step
+        """
+        return sum(self._config["reward_weights"][name] * value for name, value in terms.items())

@@ -1,7 +1,6 @@
 """The frame that all driving scenarios share: spaces, time, physics, costs, rewards and the episode's record."""
 
 import math
-from collections import Counter
 from typing import Any
 
 import gymnasium
@@ -9,19 +8,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_esad.envs import rewards
 from sb3_esad.envs.config import check_config, merge_config
 from sb3_esad.envs.geometry import wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
+from sb3_esad.envs.rewards import DrivingReward
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 from sb3_esad.envs.vehicle import Controls
-
-REGION_LENGTH = 20.0  # [m]
 
 
 class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
@@ -58,7 +55,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.observation: Observation = OBSERVATIONS[observation](self.config)
         self.observation_space = self.observation.space
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
-        self._visits: Counter[tuple[int, int]] = Counter()
+        self.reward = DrivingReward(self.config)
         self._window: Any = None
 
     @classmethod
@@ -156,7 +153,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         """
         super().reset(seed=seed)
         if seed is not None:
-            self._visits.clear()
+            self.reward.forget()
         self.road = self._make_road()
         self.traffic = self._make_traffic()
         self.episode = Episode(self.route_length)
@@ -179,7 +176,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             raise ValueError(f"action {action} is not two finite numbers; give acceleration and steering in [-1, 1]")
         self._drive(np.clip(action, -1.0, 1.0))
         terms = self._reward_terms()
-        reward = sum(self.config["reward_weights"][name] * value for name, value in terms.items())
+        reward = self.reward.total(terms)
         cost_terms = self._cost_terms()
         ttc = time_to_collision(self.traffic)
         cost = max(float(any(cost_terms.values())), self._graded_cost(ttc))
@@ -244,20 +241,9 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return max(1.0 - ttc / self.config["graded_cost_ttc"], 0.0) if self.config["graded_cost"] else 0.0
 
     def _reward_terms(self) -> dict[str, float]:
-        config, traffic = self.config, self.traffic
-        lane, target = int(traffic.lane[EGO]), config["target_speed"]
-        along_route = float(traffic.speed[EGO]) * math.cos(self.heading_error)
-        share = rewards.progress_share(along_route, target)
-        region = (lane, int(self._progress() // REGION_LENGTH))
-        visits = self._visits[region]
-        self._visits[region] += 1
-        offset = float(traffic.across[lane, EGO])
-        return {
-            "velocity": rewards.velocity_reward(along_route, target, config["velocity_sharpness"]),
-            "lane": rewards.lane_reward(offset, config["lane_tolerance"]) * share,
-            "orientation": rewards.orientation_reward(self.heading_error, config["orientation_sharpness"]) * share,
-            "exploration": rewards.exploration_reward(visits, config["exploration_decay"]),
-        }
+        traffic, lane = self.traffic, int(self.traffic.lane[EGO])
+        speed, offset = float(traffic.speed[EGO]), float(traffic.across[lane, EGO])
+        return self.reward.terms(speed, self.heading_error, lane, offset, self._progress())
 
     def render(self) -> NDArray[np.uint8] | None:
         """
