@@ -2,7 +2,11 @@
 
 from gymnasium.envs.registration import register
 
-_SCENARIOS = {"highway": "sb3_esad.envs.highway:Highway"}
+_SCENARIOS = {
+    "highway": "sb3_esad.envs.highway:Highway",
+    "obstacle-avoidance": "sb3_esad.envs.obstacles:ObstacleAvoidance",
+    "braking": "sb3_esad.envs.braking:Braking",
+}
 _OBSERVATIONS = {"": "image", "-vector": "vector", "-dict": "dict"}
 
 for _name, _entry_point in _SCENARIOS.items():

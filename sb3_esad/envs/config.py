@@ -57,12 +57,18 @@ RULES = (
         "a number from 0 on",
     ),
     Rule(
-        ("ahead", "slow_share", "fast_share", "slowdown_share"),
+        (
+            *("ahead", "slow_share", "fast_share", "slowdown_share"),
+            *("cut_in_share", "cut_in_braking_share", "second_block_share"),
+        ),
         lambda value: _is_finite(value) and 0 <= value <= 1,
         "a share from 0 to 1",
     ),
     Rule(
-        ("start_speed", "headway", "desired_speed", "slow_speed", "fast_speed", "merge_start", "slowdown_start"),
+        (
+            *("start_speed", "headway", "desired_speed", "slow_speed", "fast_speed", "merge_start", "slowdown_start"),
+            *("event_pause", "event_braking", "halt_duration", "block_pause", "block_appears"),
+        ),
         _is_range,
         "two numbers from 0 on, the smaller one first",
     ),

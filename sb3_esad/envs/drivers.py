@@ -11,6 +11,7 @@ from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 
 HEADING_GAIN, LATERAL_GAIN = 2.5, 0.7  # gentler than the traffic's, for who decides 5 times a second [1/s]
+CREEP_SPEED, CREEP_ROOM = 3.0, 6.5  # [m/s], between centres [m]
 SETTLED_OFFSET, SETTLED_HEADING = 0.5, 0.05  # a lane change is over within these [m], [rad]
 _SELF = np.array([EGO])
 
@@ -54,8 +55,11 @@ class CarFollower(SpeedKeeper):
         """See :meth:`SpeedKeeper.__call__`."""
         scenario = scenario_of(env)
         lane = self._lane(scenario)
+        return self._action(scenario, self._acceleration(scenario, lane), lane)
+
+    def _acceleration(self, scenario: Scenario, lane: int) -> float:
         lanes = {int(scenario.traffic.lane[EGO]), lane}
-        return self._action(scenario, min(self._following(scenario, each) for each in lanes), lane)
+        return min(self._following(scenario, each) for each in lanes)
 
     def _lane(self, scenario: Scenario) -> int:
         return int(scenario.traffic.lane[EGO])
@@ -80,9 +84,24 @@ class ReferenceDriver(CarFollower):
         if lane != self._target:
             if traffic.rival_ahead(EGO, self._target, traffic.target_lane):
                 self._target = lane
-        elif abs(traffic.across[lane, EGO]) < SETTLED_OFFSET and abs(scenario.heading_error) < SETTLED_HEADING:
+        elif self._is_settled(scenario, lane):
             self._target = self._best_lane(scenario, lane)
         return self._target
+
+    def _acceleration(self, scenario: Scenario, lane: int) -> float:
+        """Who stands behind an obstacle gets out of its lane at a walking pace, for to follow the obstacle is to stay."""
+        traffic, wanted = scenario.traffic, super()._acceleration(scenario, lane)
+        own_lane, speed = int(traffic.lane[EGO]), float(traffic.speed[EGO])
+        front = traffic.front[:1]
+        if lane == own_lane or front[0] < 0 or traffic.speed[front[0]] > 0 or traffic.distance(_SELF, front)[0] < CREEP_ROOM:
+            return wanted
+        return max(wanted, min(CREEP_SPEED - speed, self._following(scenario, lane)))
+
+    @staticmethod
+    def _is_settled(scenario: Scenario, lane: int) -> bool:
+        traffic = scenario.traffic
+        straight = abs(scenario.heading_error) < SETTLED_HEADING
+        return abs(traffic.across[lane, EGO]) < SETTLED_OFFSET and (straight or traffic.speed[EGO] < CREEP_SPEED)
 
     @staticmethod
     def _best_lane(scenario: Scenario, lane: int) -> int:

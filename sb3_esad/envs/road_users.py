@@ -7,11 +7,11 @@ import numpy as np
 from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lanes import CAR_LENGTH, NO_LANE
 from sb3_esad.envs.roads import Bools, Ints, Road
-from sb3_esad.envs.users import User
+from sb3_esad.envs.users import Kind, User
 
 EGO = 0  # row of the ego vehicle in every array
 TOP_SPEED = 40.0  # [m/s]
-LANE_MARGIN = 1.0  # a car this far past the line still counts as being in the lane [m]
+LANE_MARGIN = 1.0  # who moves and is this far past the line still counts as being in the lane [m]
 INTENTION_HORIZON = 1.5  # others read where the ego vehicle is going from where it will be after this time [s]
 LOOKAHEAD = 3  # lanes that are looked into beyond the present one
 
@@ -32,6 +32,7 @@ class RoadUsers:
         self.size = np.array([user.size for user in users], dtype=np.float64)
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
         self.kind = np.array([user.kind for user in users], dtype=np.int64)
+        self._margin = np.where(self.kind == Kind.STATIC, self.size[:, 1] / 2, LANE_MARGIN)
         self.drivers = np.flatnonzero([user.drives for user in users])
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
@@ -59,7 +60,7 @@ class RoadUsers:
         lane = road.closest_lane(along, across, np.concatenate([self.heading, self.heading[self.outsiders]]))
         self.along, self.across = along[:, :count], across[:, :count]
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
-        within = np.abs(self.across) <= road.width[:, None] / 2 + LANE_MARGIN
+        within = np.abs(self.across) <= road.width[:, None] / 2 + self._margin
         self.present = within & (road.overshoot(self.along) <= CAR_LENGTH)
         # Others make room for a user that they do not steer in the lane where it will soon be, too.
         self.present[self.target_lane[self.outsiders], self.outsiders] = True

@@ -13,7 +13,6 @@ from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Temper, User
 
 ROAD_START, ROAD_RUNOUT = -300.0, 1000.0  # the lanes go on before the start and past the end of the route [m]
-EGO_TEMPER = Temper(headway=0.9, gap=8.0, imposed_braking=3.0, gain=0.1)  # how scripted drivers drive the ego vehicle
 
 
 def parallel_lanes(count: int, route_length: float) -> list[Lane]:
@@ -50,7 +49,13 @@ def straight_road(lanes: int, route_length: float) -> Road:
 
 
 class StraightDrive(Scenario):
-    """Drive along a straight road through traffic; subclasses add what happens there. See :class:`Scenario`."""
+    """
+    Drive along a straight road through traffic; subclasses add what happens there. See :class:`Scenario`.
+
+    ``ego_temper`` is how scripted drivers drive the ego vehicle.
+    """
+
+    ego_temper = Temper(headway=0.9, gap=8.0, imposed_braking=3.0, gain=0.1)
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
@@ -81,7 +86,7 @@ class StraightDrive(Scenario):
         own_lane = int(self.np_random.integers(self.lanes))
         speed = float(self.np_random.uniform(*self.config["start_speed"]))
         place, target = (0.0, own_lane * LANE_WIDTH), self.config["target_speed"]
-        ego = User(place, speed=speed, target_speed=target, drives=False, temper=EGO_TEMPER)
+        ego = User(place, speed=speed, target_speed=target, drives=False, temper=self.ego_temper)
         cars = [car for lane in range(self.lanes) for car in self._lane_traffic(lane, lane == own_lane)]
         return Traffic(self.road, [ego, *cars, *self._others()])
 

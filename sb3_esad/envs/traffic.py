@@ -46,6 +46,7 @@ class Traffic(RoadUsers):
         own = self.temper
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
         self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking])
+        self.forced_braking = np.zeros(len(users))  # a scenario makes a car brake this hard, whatever it would do [m/s^2]
         super().__init__(road, users)
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
@@ -117,7 +118,8 @@ class Traffic(RoadUsers):
             cars = rows[changing]
             front, _ = self.neighbours(cars, target[changing])
             acceleration[changing] = np.minimum(acceleration[changing], self.following_acceleration(cars, front, cars))
-        self.acceleration[rows] = bounded(acceleration, MAX_ACCELERATION)
+        forced = self.forced_braking[rows]
+        self.acceleration[rows] = np.where(forced > 0.0, -forced, bounded(acceleration, MAX_ACCELERATION))
 
     def _continue_lanes(self, rows: Ints) -> None:
         target = self.target_lane[rows]

@@ -1,0 +1,166 @@
+"""Every registered scenario is a well-behaved environment, can be solved and is not trivial."""
+
+import pickle
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+from stable_baselines3.common.env_checker import check_env as check_sb3_env
+
+from sb3_esad.driving_evaluation import evaluate_driver
+from sb3_esad.envs.braking import Braking
+from sb3_esad.envs.config import RULES
+from sb3_esad.envs.drivers import CarFollower, SpeedKeeper
+from sb3_esad.envs.geometry import box_corners, boxes_overlap
+from sb3_esad.envs.highway import Highway
+from sb3_esad.envs.metrics import summarise
+from sb3_esad.envs.obstacles import NOWHERE, ObstacleAvoidance
+from sb3_esad.envs.road_users import EGO
+from sb3_esad.envs.scenario import Scenario
+
+SCENARIOS: dict[str, type[Scenario]] = {"highway": Highway, "obstacle-avoidance": ObstacleAvoidance, "braking": Braking}
+IDS = [f"esad-{name}{suffix}-v0" for name in SCENARIOS for suffix in ("", "-vector", "-dict")]
+
+
+def make(env_id: str, **kwargs: Any) -> Any:
+    """The scenario itself, without gymnasium's wrappers."""
+    return gymnasium.make(env_id, **kwargs).unwrapped
+
+
+def play(env: Any, actions: np.ndarray) -> list[Any]:
+    """Everything that a rollout returns, as bytes and plain values."""
+    seen: list[Any] = []
+    for action in actions:
+        observation, reward, terminated, truncated, info = env.step(action)
+        arrays = observation.values() if isinstance(observation, dict) else [observation]
+        seen.append(([array.tobytes() for array in arrays], reward, terminated, truncated, repr(info)))
+        if terminated or truncated:
+            break
+    return seen
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_checkers_are_content(env_id: str) -> None:
+    check_env(make(env_id), skip_render_check=True)
+    check_sb3_env(gymnasium.make(env_id))
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_same_seed_same_episode_to_the_bit(env_id: str) -> None:
+    actions = np.random.default_rng(0).uniform(-0.3, 0.3, (80, 2)).astype(np.float32)
+    env, other = make(env_id), make(env_id)
+    env.reset(seed=1)
+    play(env, actions)
+    env.reset(seed=7)
+    other.reset(seed=7)
+    first, second = play(env, actions), play(other, actions)
+    assert len(first) > 10
+    assert first == second
+    other.reset(seed=8)
+    assert play(other, actions) != first
+
+
+@pytest.mark.parametrize("env_id", IDS)
+def test_pickling_in_mid_episode(env_id: str) -> None:
+    actions = np.random.default_rng(1).uniform(-0.3, 0.3, (60, 2)).astype(np.float32)
+    env = make(env_id)
+    env.reset(seed=5)
+    play(env, actions[:20])
+    copy = pickle.loads(pickle.dumps(env))
+    assert play(copy, actions[20:]) == play(env, actions[20:])
+
+
+def test_every_setting_is_checked() -> None:
+    """A key that no rule knows would be taken as it comes."""
+    checked = {name for rule in RULES for name in rule.names}
+    others = {"reward_weights", "graded_cost", "frame"}
+    assert set().union(*(scenario.default_config() for scenario in SCENARIOS.values())) == checked | others
+
+
+@pytest.mark.parametrize("name", SCENARIOS)
+def test_it_can_be_solved_and_is_not_trivial(name: str) -> None:
+    """Thirty of the hundred seeds of the table in the README."""
+    env_id, seeds = f"esad-{name}-vector-v0", range(30)
+    reference, keeper, chance = (
+        summarise(evaluate_driver(driver, env_id, seeds)) for driver in ("reference", "keeper", "random")
+    )
+    assert reference["DS"] >= 95
+    assert reference["collision_free"] >= 0.96
+    assert keeper["DS"] <= reference["DS"] - 25
+    assert chance["DS"] < 25
+    assert reference["speed"] > 0.7 * SCENARIOS[name].default_config()["target_speed"]
+
+
+def test_on_the_highway_following_is_enough_and_quick() -> None:
+    follower = summarise(evaluate_driver("follower", "esad-highway-vector-v0", range(30)))
+    assert follower["collision_free"] >= 0.95
+    assert follower["speed"] > 19.5
+
+
+def test_the_car_ahead_brakes_to_a_halt_and_drives_on() -> None:
+    env, follow = make("esad-braking-vector-v0", config={"cut_in_share": 0.0, "lane_counts": (2, 2)}), CarFollower()
+    for seed in range(3):
+        env.reset(seed=seed)
+        while not env.traffic.forced_braking.any():
+            env.step(follow(env))
+        car, speeds = env.traffic.forced_braking.argmax(), []
+        while env.traffic.forced_braking[car]:
+            speeds.append(float(env.traffic.speed[car]))
+            env.step(follow(env))
+        slowing = -np.diff(speeds[: speeds.index(0.0)]) * env.config["policy_frequency"]
+        assert ((slowing > 6.0 - 1e-6) & (slowing < 8.0 + 1e-6)).all()
+        assert 0.5 <= speeds.count(0.0) / env.config["policy_frequency"] <= 2.5 + 0.4
+
+
+def test_cars_cut_in_close_ahead() -> None:
+    env, hold, distances = make("esad-braking-vector-v0", config={"cut_in_share": 1.0}), SpeedKeeper(), []
+    for seed in range(20):
+        env.reset(seed=seed)
+        own = int(env.traffic.lane[EGO])
+        for _ in range(60):
+            outside = env.traffic.lane != own
+            _, _, terminated, _, _ = env.step(hold(env))
+            came = np.flatnonzero(outside & (env.traffic.lane == own))
+            distances += (env.traffic.position[came, 0] - env.traffic.position[EGO, 0]).tolist()
+            if terminated:
+                break
+    assert sum(0 < distance < 25 for distance in distances) >= 5
+
+
+def test_obstacles_appear_suddenly_ahead_and_leave_a_way_out() -> None:
+    env, hold, seen = make("esad-obstacle-avoidance-vector-v0"), SpeedKeeper(), 0
+    for seed in range(20):
+        env.reset(seed=seed)
+        assert (env.traffic.position[env._obstacles] == NOWHERE).all()
+        terminated = False
+        while not terminated and (env.traffic.position[env._obstacles, 0] == NOWHERE[0]).all():
+            before = env.traffic.position[EGO, 0]
+            _, _, terminated, _, _ = env.step(hold(env))
+        there = env._obstacles[env.traffic.position[env._obstacles, 0] != NOWHERE[0]]
+        if there.size:
+            seen += 1
+            distance = env.traffic.position[there, 0] - before
+            assert 24.0 - 12.0 / 5 <= distance.min() <= 50.0
+            blocked = {int(lane) for lane in np.rint(env.traffic.position[there, 1] / 4.0)}
+            own = int(env.traffic.lane[EGO])
+            assert any(0 <= lane < env.lanes and lane not in blocked for lane in (own - 1, own + 1))
+            assert len(blocked) <= 2
+    assert seen >= 15
+
+
+@pytest.mark.parametrize("name", ["obstacle-avoidance", "braking"])
+def test_obstacles_hit_nobody_when_they_appear(name: str) -> None:
+    env, follow = make(f"esad-{name}-vector-v0"), CarFollower()
+    for seed in range(8):
+        env.reset(seed=seed)
+        for _ in range(100):
+            _, _, terminated, truncated, _ = env.step(follow(env))
+            traffic = env.traffic
+            corners = box_corners(traffic.position, traffic.heading, traffic.size)
+            here = np.flatnonzero(traffic.position[:, 0] != NOWHERE[0])
+            for index, row in enumerate(here[:-1]):
+                assert not boxes_overlap(corners[row], corners[here[index + 1 :]]).any(), f"seed {seed}"
+            if terminated or truncated:
+                break
