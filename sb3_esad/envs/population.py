@@ -1,6 +1,5 @@
 """Who is on the road: cars of mixed temper, drawn at random."""
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -45,11 +44,11 @@ class Population:
         random: np.random.Generator,
         road: Road,
         slow_share: float,
-        slow_speed: Sequence[float],
+        slow_speed: tuple[float, float],
         fast_share: float,
-        fast_speed: Sequence[float],
+        fast_speed: tuple[float, float],
         spread: float,
-        headway: Sequence[float],
+        headway: tuple[float, float],
     ) -> None:
         self.random = random
         self.road = road
