@@ -14,6 +14,7 @@ BARE = Markings(np.zeros((0, 4, 2)), np.zeros(0, bool), np.zeros((0, 2, 2)), np.
 VIEW = View(SHAPE, SCALE, AHEAD)
 BEV = BirdsEyeView(VIEW)
 ROAD = highway_road(3, 600.0, 200.0, 150.0)
+ROUTE = np.array([True, True, True, False, False])
 
 
 def scene(*users: User) -> Traffic:
@@ -28,7 +29,7 @@ def ego(x: float = 50.0, y: float = 4.0, heading: float = 0.0, speed: float = 25
 
 def see(*users: User, markings: Markings = ROAD.markings, heading: float = 0.0) -> np.ndarray:
     """Image of a scene as signed numbers."""
-    return BEV.draw(markings, scene(*users), heading).astype(int)
+    return BEV.draw(markings, ROUTE, scene(*users), heading).astype(int)
 
 
 @pytest.mark.parametrize("frame", ["lane", "ego"])
@@ -96,7 +97,7 @@ def test_a_mirrored_world_gives_the_mirrored_image() -> None:
         mirrored = [User((u.position[0], 8.0 - u.position[1]), -u.heading, u.speed) for u in users]
         flip = np.array([1.0, -1.0])
         other = Markings(
-            ROAD.markings.surfaces * flip + [0, 8], ROAD.markings.on_route, ROAD.markings.lines * flip + [0, 8],
+            ROAD.markings.surfaces * flip + [0, 8], ROAD.markings.lane, ROAD.markings.lines * flip + [0, 8],
             ROAD.markings.dashed,
         )  # fmt: skip
         difference = np.abs(see(*users)[:, :, ::-1] - see(*mirrored, markings=other))
@@ -120,7 +121,7 @@ def test_an_empty_world_is_black_but_for_the_ego_vehicle() -> None:
 
 def test_other_sizes_and_scales() -> None:
     view = View((96, 48), (1.0, 0.5), 0.75)
-    image = BirdsEyeView(view).draw(ROAD.markings, scene(ego()), 0.0)
+    image = BirdsEyeView(view).draw(ROAD.markings, ROUTE, scene(ego()), 0.0)
     assert image.shape == (3, 96, 48)
     assert image.dtype == np.uint8
     assert np.flatnonzero(image[2][:, 4:-4].any(1)).mean() == pytest.approx(96 * 0.75 - 0.5, abs=1.0)

@@ -13,7 +13,7 @@ from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, Temper, User
 
 LANES, LENGTH, DT = 4, 10_000.0, 0.1
-NOTHING = Markings(np.zeros((0, 4, 2)), np.zeros(0, bool), dashes(0, 0, 0), np.zeros(0, bool))
+NOTHING = Markings(np.zeros((0, 4, 2)), np.zeros(0, int), dashes(0, 0, 0), np.zeros(0, bool))
 
 
 def straight_road(lanes: int = LANES, length: float = LENGTH) -> Road:

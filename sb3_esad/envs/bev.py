@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs.geometry import Floats, box_corners
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.roads import Markings
+from sb3_esad.envs.roads import Bools, Markings
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 
@@ -145,11 +145,12 @@ class BirdsEyeView:
     def __init__(self, view: View) -> None:
         self.view = view
 
-    def draw(self, markings: Markings, traffic: Traffic, heading: float) -> Image:
+    def draw(self, markings: Markings, route: Bools, traffic: Traffic, heading: float) -> Image:
         """
         Draw the surroundings of the ego vehicle.
 
         :param markings: of the road
+        :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
         :param traffic: all road users
         :param heading: the direction that points up [rad]
         :return: the image, shape ``(3, rows, columns)``
@@ -163,7 +164,7 @@ class BirdsEyeView:
         asphalt = view.pixels(markings.surfaces, origin, heading)
         boxes = inset(view.pixels(corners, origin, heading))
         layers = [road] * len(asphalt) + [users if moving else obstacles for moving in moves]
-        greys = [ROUTE_GREY if on_route else OFF_ROUTE_GREY for on_route in markings.on_route] + user_greys(traffic)
+        greys = [ROUTE_GREY if on_route else OFF_ROUTE_GREY for on_route in route[markings.lane]] + user_greys(traffic)
         view.fill(layers, np.concatenate([asphalt, boxes]), greys)
         paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
         view.lines(road, view.pixels(markings.lines, origin, heading), paint)

@@ -33,7 +33,7 @@ def draw_scene(scenario: Scenario) -> Image:
     origin, heading = traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error
     canvas = np.empty((*PICTURE.shape, 3), dtype=np.uint8)
     canvas[:] = GRASS
-    asphalt = [ROUTE if on_route else ASPHALT for on_route in markings.on_route]
+    asphalt = [ROUTE if on_route else ASPHALT for on_route in scenario.route.contains[markings.lane]]
     PICTURE.fill([canvas] * len(asphalt), PICTURE.pixels(markings.surfaces, origin, heading), asphalt)
     lines = PICTURE.pixels(markings.lines, origin, heading)
     PICTURE.lines(canvas, lines, [PAINT] * len(lines), 2)

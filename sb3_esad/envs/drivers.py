@@ -105,8 +105,8 @@ class ReferenceDriver(CarFollower):
 
     @staticmethod
     def _best_lane(scenario: Scenario, lane: int) -> int:
-        road, traffic = scenario.road, scenario.traffic
-        beside = [int(each) for each in (road.left[lane], road.right[lane]) if each != NO_LANE and road.on_route[each]]
+        road, traffic, route = scenario.road, scenario.traffic, scenario.route
+        beside = [int(each) for each in (road.left[lane], road.right[lane]) if each != NO_LANE and route.contains[each]]
         worth = [each for each in beside if traffic.change_is_worth_it(_SELF, np.array([each]))[0]]
         return max(worth, key=lambda each: CarFollower._following(scenario, each)) if worth else lane
 

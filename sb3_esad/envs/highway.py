@@ -26,8 +26,8 @@ def highway_road(lanes: int, route_length: float, merge: float, merge_length: fl
     :return: lanes from left to right, then the acceleration lane, then the ramp's approach
     """
     side = lanes * LANE_WIDTH
-    acceleration = Lane.between((merge, side), (merge + merge_length, side), left=lanes - 1, on_route=False)
-    approach = Lane.between((merge - RAMP_LENGTH, side + RAMP_OFFSET), (merge, side), following=lanes, on_route=False)
+    acceleration = Lane.between((merge, side), (merge + merge_length, side), left=lanes - 1)
+    approach = Lane.between((merge - RAMP_LENGTH, side + RAMP_OFFSET), (merge, side), following=lanes)
     main = parallel_lanes(lanes, route_length)
     return Road([*main, acceleration, approach], _markings(lanes, route_length, merge, merge_length))
 
@@ -53,7 +53,7 @@ def _markings(lanes: int, route_length: float, merge: float, merge_length: float
     between = [dashes(ROAD_START, route_length, y) for y in left + LANE_WIDTH * np.arange(1, lanes)]
     dashed = np.concatenate([*between, dashes(merge, far, right)])
     is_dash = np.arange(len(dashed) + len(solid)) < len(dashed)
-    return Markings(np.array(asphalt), np.array([False, False, True]), np.concatenate([dashed, np.array(solid)]), is_dash)
+    return Markings(np.array(asphalt), np.array([lanes + 1, lanes, 0]), np.concatenate([dashed, np.array(solid)]), is_dash)
 
 
 class Highway(StraightDrive):
@@ -75,10 +75,9 @@ class Highway(StraightDrive):
 
     def _make_road(self) -> Road:
         config = self.config
-        self.route_length = config["route_length"]
         self.lanes = int(self.np_random.choice(config["lane_counts"]))
         self.merge = float(self.np_random.uniform(*config["merge_start"]))
-        return highway_road(self.lanes, self.route_length, self.merge, config["merge_length"])
+        return highway_road(self.lanes, config["route_length"], self.merge, config["merge_length"])
 
     def _others(self) -> list[User]:
         self._draw_slowdown()

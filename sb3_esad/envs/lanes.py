@@ -1,8 +1,10 @@
-"""One lane of a road: straight or an arc, and its place among the others."""
+"""One lane of a road: a piece of constant curvature, and its place among the others."""
 
 import math
 from dataclasses import dataclass
 from typing import Any
+
+from sb3_esad.envs.pieces import Piece
 
 CAR_LENGTH = 5.0
 NO_LANE = -1
@@ -10,30 +12,20 @@ LANE_WIDTH = 4.0
 
 
 @dataclass(frozen=True)
-class Lane:
+class Lane(Piece):
     """
-    A lane of constant curvature.
+    A lane of constant curvature; the fields of :class:`Piece` are those of its centre line.
 
-    :param start: first point of the centre line [m]
-    :param heading: direction at the start [rad]
-    :param length: of the centre line [m]
-    :param curvature: 0 for a straight lane, positive where it turns right [1/m]
     :param left: index of the lane one may change to on the left, ``NO_LANE`` if there is none
     :param right: the same on the right
     :param following: index of the lane that continues this one for who has no path, ``NO_LANE`` if it ends
-    :param on_route: whether the ego vehicle's route leads along this lane
     :param speed_limit: [m/s]
     :param width: [m]
     """
 
-    start: tuple[float, float]
-    heading: float
-    length: float
-    curvature: float = 0.0
     left: int = NO_LANE
     right: int = NO_LANE
     following: int = NO_LANE
-    on_route: bool = True
     speed_limit: float = 30.0
     width: float = LANE_WIDTH
 

@@ -12,6 +12,7 @@ from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.lanes import LANE_WIDTH
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
+from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
 
 SPEED_SCALE, DISTANCE_SCALE, WIDTH_SCALE = 30.0, 100.0, 16.0  # [m/s], [m], [m]
@@ -24,6 +25,7 @@ class Scene(Protocol):
     """What an observation may look at."""
 
     road: Road
+    route: Route
     traffic: Traffic
 
     @property
@@ -68,7 +70,7 @@ class ImageObservation:
         """See :meth:`Observation.observe`."""
         traffic = scene.traffic
         heading = traffic.heading[EGO] - (scene.heading_error if self._frame == "lane" else 0.0)
-        return self._bev.draw(scene.road.markings, traffic, heading)
+        return self._bev.draw(scene.road.markings, scene.route.contains, traffic, heading)
 
 
 class EgoObservation:

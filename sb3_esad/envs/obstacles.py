@@ -61,7 +61,7 @@ class ObstacleAvoidance(StraightDrive):
         random, config = self.np_random, self.config
         self._places: list[tuple[float, float, int]] = []
         x = float(random.uniform(*config["block_pause"]))
-        while x < self.route_length:
+        while x < config["route_length"]:
             lanes = 1 + int(self.lanes > 2 and random.random() < config["second_block_share"])
             self._places.append((x, float(random.uniform(*config["block_appears"])), lanes))
             x += float(random.uniform(*config["block_pause"]))

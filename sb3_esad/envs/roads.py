@@ -21,13 +21,13 @@ class Markings:
     What a drawing shows of a road, in metres.
 
     :param surfaces: convex pieces of asphalt with four corners each, drawn in this order, shape ``(p, 4, 2)``
-    :param on_route: whether each piece belongs to the ego vehicle's route, shape ``(p,)``
+    :param lane: index of a lane that runs along each piece, shape ``(p,)``
     :param lines: painted lines and single dashes from point to point, fixed to the ground, shape ``(n, 2, 2)``
     :param dashed: whether each is a dash, shape ``(n,)``
     """
 
     surfaces: Floats
-    on_route: Bools
+    lane: Ints
     lines: Floats
     dashed: Bools
 
@@ -41,6 +41,7 @@ class Road:
     """
 
     def __init__(self, lanes: Sequence[Lane], markings: Markings) -> None:
+        self.lanes = tuple(lanes)
         self.markings = markings
         self.start = np.array([lane.start for lane in lanes], dtype=np.float64)
         self.heading = np.array([lane.heading for lane in lanes], dtype=np.float64)
@@ -52,7 +53,6 @@ class Road:
         self.left = np.array([lane.left for lane in lanes])
         self.right = np.array([lane.right for lane in lanes])
         self.following = np.array([lane.following for lane in lanes])
-        self.on_route = np.array([lane.on_route for lane in lanes])
         self._describe_arcs()
 
     def _describe_arcs(self) -> None:
@@ -103,12 +103,7 @@ class Road:
         :param across: distance to the right of its centre [m]
         :return: the point, shape ``(2,)`` [m]
         """
-        curvature, heading = self.curvature[lane], self.heading[lane]
-        turned = heading + curvature * along
-        chord = along * np.sinc(curvature * along / (2 * np.pi))
-        middle = heading + curvature * along / 2
-        forward = chord * np.array([np.cos(middle), np.sin(middle)])
-        return np.asarray(self.start[lane] + forward + across * np.array([-np.sin(turned), np.cos(turned)]))
+        return self.lanes[lane].position(along, across)
 
     def overshoot(self, along: Floats) -> Floats:
         """

@@ -16,6 +16,7 @@ from sb3_esad.envs.observations import OBSERVATIONS, Observation
 from sb3_esad.envs.rewards import DrivingReward
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
+from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 from sb3_esad.envs.vehicle import Controls
@@ -37,8 +38,8 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
 
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 5}  # noqa: RUF012 - typed by gymnasium
     road: Road
+    route: Route
     traffic: Traffic
-    route_length: float
 
     def __init__(
         self, config: dict[str, Any] | None = None, observation: str = "image", render_mode: str | None = None
@@ -93,6 +94,10 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         """Build the road; drawn anew at every reset."""
         raise NotImplementedError
 
+    def _make_route(self) -> Route:
+        """Choose the way to take on ``self.road``."""
+        raise NotImplementedError
+
     def _make_traffic(self) -> Traffic:
         """Place the ego vehicle (first) and all others on ``self.road``."""
         raise NotImplementedError
@@ -110,7 +115,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
 
     def _is_success(self) -> bool:
         """Whether the route's end is reached."""
-        return self._progress() >= self.route_length
+        return self._progress() >= self.route.length
 
     def _is_terminated(self) -> bool:
         """Whether the episode ends in a terminal state."""
@@ -141,7 +146,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     @property
     def remaining(self) -> float:
         """Share of the route that lies ahead, within [0, 1]."""
-        return min(max(1.0 - self._progress() / self.route_length, 0.0), 1.0)
+        return min(max(1.0 - self._progress() / self.route.length, 0.0), 1.0)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Any, dict[str, Any]]:
         """
@@ -155,8 +160,9 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         if seed is not None:
             self.reward.forget()
         self.road = self._make_road()
+        self.route = self._make_route()
         self.traffic = self._make_traffic()
-        self.episode = Episode(self.route_length)
+        self.episode = Episode(self.route.length)
         self.collided = False
         self.off_road = False
         if self.render_mode == "human":
@@ -211,7 +217,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             self._check_crash()
             if self.crashed:
                 break
-        on_route = bool(self.road.on_route[traffic.lane[EGO]]) and not self._wrong_way()
+        on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self._wrong_way()
         self.episode.add_motion(duration, metres, self._progress(), on_route)
 
     def _check_crash(self) -> None:

@@ -8,6 +8,7 @@ from sb3_esad.envs.lanes import LANE_WIDTH, NO_LANE, Lane
 from sb3_esad.envs.population import Population, Stretch
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Markings, Road, dashes
+from sb3_esad.envs.routes import Route
 from sb3_esad.envs.scenario import Scenario
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Temper, User
@@ -44,7 +45,7 @@ def straight_road(lanes: int, route_length: float) -> Road:
     solid = np.array([[[ROAD_START, y], [route_length, y]] for y in (left, right)])
     dashed = np.concatenate([dashes(ROAD_START, route_length, left + LANE_WIDTH * index) for index in range(1, lanes)])
     is_dash = np.arange(len(dashed) + len(solid)) < len(dashed)
-    markings = Markings(np.array(asphalt), np.array([True]), np.concatenate([dashed, solid]), is_dash)
+    markings = Markings(np.array(asphalt), np.array([0]), np.concatenate([dashed, solid]), is_dash)
     return Road(parallel_lanes(lanes, route_length), markings)
 
 
@@ -77,9 +78,11 @@ class StraightDrive(Scenario):
         }
 
     def _make_road(self) -> Road:
-        self.route_length = self.config["route_length"]
         self.lanes = int(self.np_random.choice(self.config["lane_counts"]))
-        return straight_road(self.lanes, self.route_length)
+        return straight_road(self.lanes, self.config["route_length"])
+
+    def _make_route(self) -> Route:
+        return Route(self.road, [0], -ROAD_START, self.config["route_length"] - ROAD_START)
 
     def _make_traffic(self) -> Traffic:
         self.population = self._make_population()
