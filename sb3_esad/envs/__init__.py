@@ -4,6 +4,7 @@ from gymnasium.envs.registration import register
 
 _SCENARIOS = {
     "highway": "sb3_esad.envs.highway:Highway",
+    "traffic-negotiation": "sb3_esad.envs.negotiation:TrafficNegotiation",
     "obstacle-avoidance": "sb3_esad.envs.obstacles:ObstacleAvoidance",
     "braking": "sb3_esad.envs.braking:Braking",
 }

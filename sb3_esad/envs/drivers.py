@@ -59,7 +59,8 @@ class CarFollower(SpeedKeeper):
 
     def _acceleration(self, scenario: Scenario, lane: int) -> float:
         lanes = {int(scenario.traffic.lane[EGO]), lane}
-        return min(self._following(scenario, each) for each in lanes)
+        waiting = float(scenario.traffic.stopping_acceleration(_SELF)[0])
+        return min(waiting, *(self._following(scenario, each) for each in lanes))
 
     def _lane(self, scenario: Scenario) -> int:
         return int(scenario.traffic.lane[EGO])
@@ -79,7 +80,8 @@ class ReferenceDriver(CarFollower):
 
     def _lane(self, scenario: Scenario) -> int:
         traffic, lane = scenario.traffic, int(scenario.traffic.lane[EGO])
-        if scenario.episode is not self._episode:
+        reached = self._target not in (scenario.road.left[lane], scenario.road.right[lane])
+        if scenario.episode is not self._episode or reached:
             self._episode, self._target = scenario.episode, lane
         if lane != self._target:
             if traffic.rival_ahead(EGO, self._target, traffic.target_lane):

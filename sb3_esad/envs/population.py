@@ -106,7 +106,7 @@ class Population:
             politeness=float(random.uniform(0.0, 0.5)),
         )
 
-    def car(self, lane: int, along: float, speed: float, desired: float, temper: Temper) -> User:
+    def car(self, lane: int, along: float, speed: float, desired: float, temper: Temper, path: tuple[int, ...] = ()) -> User:
         """
         Place a car in the middle of a lane.
 
@@ -115,9 +115,10 @@ class Population:
         :param speed: [m/s]
         :param desired: the speed it would like to have [m/s]
         :param temper: how it drives
+        :param path: lanes that it will take, if it is not to take what continues its own
         :return: the car
         """
         x, y = self.road.position(lane, along).tolist()
         heading = float(self.road.heading_at(np.array([lane]), np.array([along]))[0])
         timer = float(self.random.uniform(0.0, temper.delay))
-        return User((x, y), heading, speed, desired, temper=temper, timer=timer)
+        return User((x, y), heading, speed, desired, temper=temper, timer=timer, path=path)

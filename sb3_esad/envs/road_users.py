@@ -13,6 +13,7 @@ EGO = 0  # row of the ego vehicle in every array
 TOP_SPEED = 40.0  # [m/s]
 LANE_MARGIN = 1.0  # who moves and is this far past the line still counts as being in the lane [m]
 INTENTION_HORIZON = 1.5  # others read where the ego vehicle is going from where it will be after this time [s]
+OFF_PATH = 1.5  # where lanes overlap, one is on that of one's path even if another is as much nearer [m]
 LOOKAHEAD = 3  # lanes that are looked into beyond the present one
 
 
@@ -37,19 +38,23 @@ class RoadUsers:
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
         self.wheel_angle = np.zeros(len(users))
-        self.next_lane = self._follow_paths(users)
+        self.next_lane, self._off_path = self._follow_paths(users)
         self._rows = np.arange(len(users))
         self._lookahead = LOOKAHEAD if (self.next_lane != NO_LANE).any() else 0
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
         self.target_lane[:] = self.lane
 
-    def _follow_paths(self, users: Sequence[User]) -> Ints:
-        """The lane that each user takes after each lane, shape ``(users, lanes)``."""
+    def _follow_paths(self, users: Sequence[User]) -> tuple[Ints, Floats]:
+        """The lane that each user takes after each lane, and what keeps it off lanes it will not take; ``(users, lanes)``."""
         following = np.tile(self.road.following, (len(users), 1))
+        off_path = np.zeros(following.shape)
         for row, user in enumerate(users):
-            following[row, list(user.path[:-1])] = user.path[1:]
-        return following
+            if user.path:
+                following[row, list(user.path[:-1])] = user.path[1:]
+                off_path[row] = OFF_PATH
+                off_path[row, list(self.road.with_lanes_beside(user.path))] = 0.0
+        return following, off_path
 
     def _locate(self) -> None:
         road, count = self.road, len(self.speed)
@@ -57,7 +62,8 @@ class RoadUsers:
         self.velocity = self.speed[:, None] * self.direction
         soon = self.position[self.outsiders] + INTENTION_HORIZON * self.velocity[self.outsiders]
         along, across = road.project(np.concatenate([self.position, soon]))
-        lane = road.closest_lane(along, across, np.concatenate([self.heading, self.heading[self.outsiders]]))
+        off_path = np.concatenate([self._off_path, self._off_path[self.outsiders]]).T
+        lane = road.closest_lane(along, across, np.concatenate([self.heading, self.heading[self.outsiders]]), off_path)
         self.along, self.across = along[:, :count], across[:, :count]
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
         within = np.abs(self.across) <= road.width[:, None] / 2 + self._margin

@@ -1,6 +1,6 @@
 """Roads as arrays of lanes, onto which all road users are projected at once."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,17 +114,35 @@ class Road:
         """
         return np.maximum(along - self.length[:, None], 0.0) + np.maximum(-along, 0.0)
 
-    def closest_lane(self, along: Floats, across: Floats, heading: Floats) -> Ints:
+    def with_lanes_beside(self, lanes: Iterable[int]) -> set[int]:
+        """
+        Add the lanes that one may change to.
+
+        :param lanes: indices of lanes
+        :return: these and all lanes of the same direction beside them
+        """
+        found: set[int] = set()
+        for lane in lanes:
+            found.add(lane)
+            for beside in (self.left, self.right):
+                each = int(beside[lane])
+                while each != NO_LANE:
+                    found.add(each)
+                    each = int(beside[each])
+        return found
+
+    def closest_lane(self, along: Floats, across: Floats, heading: Floats, handicap: Floats) -> Ints:
         """
         Lane each point is on, by distance plus difference in heading (as highway-env does).
 
         :param along: from :meth:`project`, shape ``(lanes, n)`` [m]
         :param across: from :meth:`project`, shape ``(lanes, n)`` [m]
         :param heading: of the users, shape ``(n,)`` [rad]
+        :param handicap: added to the distance, shape ``(lanes, n)`` [m]
         :return: lane indices, shape ``(n,)``
         """
         turn = np.abs(wrap_angle(heading - self.heading[:, None] - self.curvature[:, None] * along))
-        return np.asarray(np.argmin(np.abs(across) + self.overshoot(along) + turn, axis=0))
+        return np.asarray(np.argmin(np.abs(across) + self.overshoot(along) + turn + handicap, axis=0))
 
     def contains(self, position: Floats) -> Bools:
         """

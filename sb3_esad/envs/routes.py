@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.roads import Road
 
 
@@ -25,21 +24,11 @@ class Route:
         self._stretch = np.ones(len(road.length))
         metres = -start
         for lane in lanes:
-            for each in self._side_by_side(road, lane):
+            for each in road.with_lanes_beside([lane]):
                 self.contains[each] = True
                 self._before[each], self._stretch[each] = metres, road.length[lane] / road.length[each]
             metres += float(road.length[lane])
         self.length = metres - float(road.length[lanes[-1]]) + end
-
-    @staticmethod
-    def _side_by_side(road: Road, lane: int) -> list[int]:
-        lanes = [lane]
-        for beside in (road.left, road.right):
-            each: int = int(beside[lane])
-            while each != NO_LANE:
-                lanes.append(each)
-                each = int(beside[each])
-        return lanes
 
     def progress(self, lane: int, along: float) -> float:
         """

@@ -14,6 +14,8 @@ from sb3_esad.envs.users import Temper, User
 HEADING_GAIN, LATERAL_GAIN = 1 / 0.2, 1 / 0.6  # [1/s]
 MAX_WHEEL_ANGLE, MAX_APPROACH_ANGLE = np.pi / 3, np.pi / 4  # [rad]
 MAX_ACCELERATION = 6.0  # [m/s^2]
+EASY_BRAKING = 2.0  # cars slow down like this for lanes with a lower limit [m/s^2]
+STOP_GAP, STOP_HEADWAY = CAR_LENGTH / 2 + 1.0, 0.3  # centre to line [m], [s]
 PURSUIT = 0.1  # cars take the direction that their lane will have after this time [s]
 
 
@@ -47,7 +49,23 @@ class Traffic(RoadUsers):
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
         self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking])
         self.forced_braking = np.zeros(len(users))  # a scenario makes a car brake this hard, whatever it would do [m/s^2]
+        self.stop_distance = np.full(len(users), np.inf)  # to a line before which a car must wait, from its centre [m]
         super().__init__(road, users)
+
+    def _locate(self) -> None:
+        super()._locate()
+        self.speed_limit = self._foresee_limits()
+
+    def _foresee_limits(self) -> Floats:
+        """The speed from which each user can still slow down in time for the lanes ahead, shape ``(n,)``."""
+        road, lanes = self.road, self.lane
+        limit, distance = road.speed_limit[lanes], -self.along[lanes, self._rows]
+        for _ in range(self._lookahead):
+            distance = distance + road.length[lanes]
+            lanes = np.where(lanes == NO_LANE, NO_LANE, self.next_lane[self._rows, lanes])
+            in_time = np.sqrt(road.speed_limit[lanes] ** 2 + 2 * EASY_BRAKING * np.maximum(distance, 0.0))
+            limit = np.where(lanes == NO_LANE, limit, np.minimum(limit, in_time))
+        return limit
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
         """
@@ -59,13 +77,27 @@ class Traffic(RoadUsers):
         :return: accelerations, shape ``(n,)`` [m/s^2]
         """
         acceleration, exponent, gap, headway, braking = self._following[:, judges]
-        lane, speed = self.lane[rows], self.speed[rows]
-        desired = not_zero(np.minimum(self.target_speed[rows], self.road.speed_limit[lane]))
+        speed = self.speed[rows]
+        desired = not_zero(np.minimum(self.target_speed[rows], self.speed_limit[rows]))
         distance = not_zero(self.distance(rows, front))
         closing = np.einsum("nd,nd->n", self.velocity[rows] - self.velocity[front], self.direction[rows])
         wanted = gap + speed * headway + speed * closing / braking
         crowding = (front >= 0) * (wanted / distance) ** 2
         return (rows >= 0) * acceleration * (1.0 - (speed / desired) ** exponent - crowding)
+
+    def stopping_acceleration(self, rows: Ints) -> Floats:
+        """
+        Acceleration by the Intelligent Driver Model towards a line before which one must wait.
+
+        :param rows: the users, shape ``(n,)``
+        :return: infinite for who need not wait, shape ``(n,)`` [m/s^2]
+        """
+        distance, speed = self.stop_distance[rows], self.speed[rows]
+        acceleration, _, _, _, braking = self._following[:, rows]
+        wanted = STOP_GAP + STOP_HEADWAY * speed + speed**2 / braking
+        free = acceleration * (1.0 - (speed / not_zero(self.target_speed[rows])) ** 4)
+        stopping = free - acceleration * (wanted / np.maximum(distance, 0.1)) ** 2
+        return np.where(distance < np.inf, stopping, np.inf)
 
     def change_is_worth_it(self, rows: Ints, lanes: Ints) -> Bools:
         """
@@ -118,6 +150,7 @@ class Traffic(RoadUsers):
             cars = rows[changing]
             front, _ = self.neighbours(cars, target[changing])
             acceleration[changing] = np.minimum(acceleration[changing], self.following_acceleration(cars, front, cars))
+        acceleration = np.minimum(acceleration, self.stopping_acceleration(rows))
         forced = self.forced_braking[rows]
         self.acceleration[rows] = np.where(forced > 0.0, -forced, bounded(acceleration, MAX_ACCELERATION))
 

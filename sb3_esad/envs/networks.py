@@ -1,0 +1,195 @@
+"""Builds roads out of streets and the junctions where they meet."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import asdict
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_esad.envs.geometry import Floats
+from sb3_esad.envs.lanes import LANE_WIDTH, NO_LANE, Lane
+from sb3_esad.envs.pieces import Piece, turning
+from sb3_esad.envs.roads import DASH_LENGTH, DASH_PERIOD, Markings, Road
+
+SIDE_TURN = math.pi / 6  # a way through a junction that turns by more than this leads to the side [rad]
+FACET = math.pi / 18  # arcs are drawn as straight facets of at most this angle [rad]
+
+
+class Carriageway(NamedTuple):
+    """
+    The lanes of one direction of a street, from the left to the right.
+
+    :param lanes: indices of each lane's pieces from start to end
+    """
+
+    lanes: tuple[tuple[int, ...], ...]
+
+    @property
+    def entries(self) -> list[int]:
+        """The first piece of each lane."""
+        return [lane[0] for lane in self.lanes]
+
+    @property
+    def exits(self) -> list[int]:
+        """The last piece of each lane."""
+        return [lane[-1] for lane in self.lanes]
+
+
+class Way(NamedTuple):
+    """
+    A way through a junction.
+
+    :param source: lane that it comes from
+    :param target: lane that it leads to
+    :param lanes: in between
+    """
+
+    source: int
+    target: int
+    lanes: tuple[int, ...]
+
+
+class Network:
+    """Collects lanes; all traffic keeps to the right."""
+
+    def __init__(self) -> None:
+        self.ways: list[Way] = []
+        self._pieces: list[Piece] = []
+        self._links: list[dict[str, Any]] = []
+        self._lines: list[Floats] = []
+        self._dashes: list[Floats] = []
+
+    def street(
+        self, pieces: Sequence[Piece], forward: int, backward: int, speed_limit: float
+    ) -> tuple[Carriageway, Carriageway]:
+        """
+        Add a street for both directions.
+
+        :param pieces: of the line between the directions
+        :param forward: number of lanes along the pieces
+        :param backward: number of lanes against them
+        :param speed_limit: [m/s]
+        :return: the lanes along the pieces, and those against them
+        """
+        there = self.carriageway(pieces, forward, speed_limit)
+        return there, self.carriageway([piece.reversed() for piece in reversed(pieces)], backward, speed_limit)
+
+    def carriageway(self, pieces: Sequence[Piece], count: int, speed_limit: float) -> Carriageway:
+        """
+        Add lanes of one direction.
+
+        :param pieces: of the line at their left
+        :param count: number of lanes
+        :param speed_limit: [m/s]
+        :return: the lanes
+        """
+        first = len(self._pieces)
+        for number, piece in enumerate(pieces):
+            for place in range(count):
+                self._add(
+                    piece.beside((place + 0.5) * LANE_WIDTH),
+                    left=len(self._pieces) - 1 if place > 0 else NO_LANE,
+                    right=len(self._pieces) + 1 if place < count - 1 else NO_LANE,
+                    following=len(self._pieces) + count if number < len(pieces) - 1 else NO_LANE,
+                    speed_limit=speed_limit,
+                )
+            self._mark(piece, count)
+        return Carriageway(tuple(tuple(range(first + place, len(self._pieces), count)) for place in range(count)))
+
+    def _add(self, piece: Piece, **links: Any) -> None:
+        self._pieces.append(piece)
+        self._links.append(links)
+
+    def _mark(self, piece: Piece, count: int) -> None:
+        self._lines += [facets(piece.beside(across)) for across in (0.0, count * LANE_WIDTH)]
+        for place in range(1, count):
+            between = piece.beside(place * LANE_WIDTH)
+            for start in np.arange(0.0, between.length, DASH_PERIOD).tolist():
+                self._dashes.append(facets(between.cut(start, min(start + DASH_LENGTH, between.length))))
+
+    def connect(self, source: int, target: int, speed_limit: float) -> Way:
+        """
+        Lead from the end of a lane to the start of another.
+
+        :param source: index of the lane that ends
+        :param target: index of the lane that starts
+        :param speed_limit: [m/s]
+        :return: the way
+        :raises ValueError: if no arc leads there
+        """
+        end, start = self._pieces[source], self._pieces[target]
+        x, y = end.end.tolist()
+        pieces = turning((x, y), end.heading_at(end.length), start.start, start.heading)
+        first = len(self._pieces)
+        for number, piece in enumerate(pieces, 1):
+            self._add(piece, following=first + number if number < len(pieces) else target, speed_limit=speed_limit)
+        if self._links[source]["following"] == NO_LANE:
+            self._links[source]["following"] = first
+        way = Way(source, target, tuple(range(first, len(self._pieces))))
+        self.ways.append(way)
+        return way
+
+    def junction(
+        self, arriving: Sequence[Carriageway], leaving: Sequence[Carriageway], speed_limit: float, turning_speed: float
+    ) -> None:
+        """
+        Lead from every street to every other one: to the right from the rightmost lane, to the left from the leftmost.
+
+        :param arriving: lanes that end here, one carriageway for each street
+        :param leaving: lanes that start here, in the same order
+        :param speed_limit: on the ways straight on [m/s]
+        :param turning_speed: on the ways to the side [m/s]
+        :raises ValueError: if a street cannot be reached by an arc
+        """
+        for number, coming in enumerate(arriving):
+            for other, going in enumerate(leaving):
+                if other != number:
+                    self._lead(coming, going, speed_limit, turning_speed)
+
+    def _lead(self, coming: Carriageway, going: Carriageway, speed_limit: float, turning_speed: float) -> None:
+        end, start = self._pieces[coming.exits[0]], self._pieces[going.entries[0]]
+        turn = math.remainder(start.heading - end.heading_at(end.length), 2 * math.pi)
+        if turn > SIDE_TURN:
+            self.connect(coming.exits[-1], going.entries[-1], turning_speed)
+        elif turn < -SIDE_TURN:
+            self.connect(coming.exits[0], going.entries[0], turning_speed)
+        else:
+            for source, target in zip(coming.exits, going.entries, strict=False):
+                self.connect(source, target, speed_limit)
+
+    def road(self) -> Road:
+        """
+        Finish.
+
+        :return: the lanes and what the drawings show of them, junctions first, lest they cover lines
+        """
+        lanes = [Lane(**asdict(piece), **links) for piece, links in zip(self._pieces, self._links, strict=True)]
+        surfaces = [surface(piece) for piece in self._pieces]
+        lines = np.concatenate([np.zeros((0, 2, 2)), *self._dashes, *self._lines])
+        is_dash = np.arange(len(lines)) < sum(map(len, self._dashes))
+        along = np.repeat(np.arange(len(lanes)), [len(each) for each in surfaces])
+        return Road(lanes, Markings(np.concatenate(surfaces), along, lines, is_dash))
+
+
+def facets(piece: Piece) -> Floats:
+    """
+    Draw a piece as straight lines.
+
+    :param piece: straight or an arc
+    :return: from point to point, shape ``(n, 2, 2)`` [m]
+    """
+    count = max(1, math.ceil(abs(piece.curvature) * piece.length / FACET))
+    points = np.array([piece.position(piece.length * index / count) for index in range(count + 1)])
+    return np.stack([points[:-1], points[1:]], axis=1)
+
+
+def surface(piece: Piece) -> Floats:
+    """
+    Draw the asphalt of a lane.
+
+    :param piece: its centre line
+    :return: convex pieces of four corners, shape ``(n, 4, 2)`` [m]
+    """
+    left, right = facets(piece.beside(-LANE_WIDTH / 2)), facets(piece.beside(LANE_WIDTH / 2))
+    return np.concatenate([left, right[:, ::-1]], axis=1)

@@ -1,0 +1,91 @@
+"""Who may enter a junction: first come, first served, as long as the ways do not cross."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from sb3_esad.envs.lanes import NO_LANE
+from sb3_esad.envs.networks import Way
+from sb3_esad.envs.road_users import LOOKAHEAD
+from sb3_esad.envs.roads import Bools, Road
+from sb3_esad.envs.traffic import Traffic
+
+ZONE = 25.0  # from here on one queues up [m]
+APART = 3.0  # ways whose centre lines come nearer to each other than this cannot be driven at the same time [m]
+
+
+class RightOfWay:
+    """
+    Lets road users wait at the line before a junction while others are on, or will be first on, a way that crosses theirs.
+
+    All users queue, the ego vehicle too, but what it does is its own affair.
+
+    :param road: the lanes
+    :param ways: through all junctions
+    """
+
+    def __init__(self, road: Road, ways: Sequence[Way]) -> None:
+        self._ways = ways
+        self._way_of = np.full(len(road.length), NO_LANE)
+        for number, way in enumerate(ways):
+            self._way_of[list(way.lanes)] = number
+        self._crosses = crossing(road, ways)
+        self._queue: dict[int, int] = {}
+
+    def regulate(self, traffic: Traffic) -> None:
+        """
+        Tell everybody where to stop.
+
+        :param traffic: all road users; ``stop_distance`` is set
+        """
+        places = {row: place for row in range(len(traffic.speed)) if (place := self._place(traffic, row))}
+        queue = {row: way for row, way in self._queue.items() if row in places and places[row][0] == way}
+        newcomers = sorted((distance, row) for row, (_, distance) in places.items() if row not in queue)
+        queue |= {row: places[row][0] for _, row in newcomers}
+        inside = [row for row in queue if places[row][1] <= 0]
+        waiting = [row for row in queue if places[row][1] > 0]
+        self._queue = {row: queue[row] for row in (*inside, *waiting)}
+        traffic.stop_distance[:] = np.inf
+        before: list[int] = []
+        for row, way in self._queue.items():
+            if places[row][1] > 0 and self._crosses[way, before].any():
+                traffic.stop_distance[row] = places[row][1]
+            before.append(way)
+
+    def _place(self, traffic: Traffic, row: int) -> tuple[int, float] | None:
+        """The way that a user is on, or comes to next, and how far it is from the line, at most 0 on the way."""
+        lane = int(traffic.lane[row]) if row in traffic.outsiders else int(traffic.target_lane[row])
+        distance = -float(traffic.along[lane, row])
+        for _ in range(LOOKAHEAD):
+            if self._way_of[lane] != NO_LANE:
+                return int(self._way_of[lane]), distance
+            distance += float(traffic.road.length[lane])
+            if distance > ZONE:
+                return None
+            lane = int(traffic.next_lane[row, lane])
+            if lane == NO_LANE:
+                return None
+        return None
+
+
+def crossing(road: Road, ways: Sequence[Way]) -> Bools:
+    """
+    Find the ways that cannot be driven at the same time: they cross or merge, and do not come from the same lane.
+
+    :param road: the lanes
+    :param ways: through junctions
+    :return: symmetric, shape ``(ways, ways)``
+    """
+    points = [np.concatenate([_points(road, lane) for lane in way.lanes]) for way in ways]
+    crosses = np.zeros((len(ways), len(ways)), dtype=bool)
+    for first, own in enumerate(ways):
+        for second in range(first):
+            apart = points[first][:, None] - points[second][None]
+            near = np.hypot(apart[..., 0], apart[..., 1]).min() < APART
+            crosses[first, second] = crosses[second, first] = near and own.source != ways[second].source
+    return crosses
+
+
+def _points(road: Road, lane: int) -> np.ndarray:
+    length = float(road.length[lane])
+    return np.array([road.position(lane, along) for along in np.linspace(0.0, length, max(2, round(length)))])
