@@ -161,10 +161,11 @@ class BirdsEyeView:
         corners = box_corners(traffic.position, traffic.heading, traffic.size)
         moves = traffic.kind == Kind.VEHICLE
         moves[EGO] = False
-        asphalt = view.pixels(markings.surfaces, origin, heading)
+        surfaces, on_route = markings.with_route_on_top(route)
+        asphalt = view.pixels(surfaces, origin, heading)
         boxes = inset(view.pixels(corners, origin, heading))
         layers = [road] * len(asphalt) + [users if moving else obstacles for moving in moves]
-        greys = [ROUTE_GREY if on_route else OFF_ROUTE_GREY for on_route in route[markings.lane]] + user_greys(traffic)
+        greys = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist() + user_greys(traffic)
         view.fill(layers, np.concatenate([asphalt, boxes]), greys)
         paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
         view.lines(road, view.pixels(markings.lines, origin, heading), paint)

@@ -43,7 +43,7 @@ RULES = (
     Rule(
         (
             *("duration", "route_length", "target_speed", "max_speed", "max_acceleration", "max_braking", "max_wheel_angle"),
-            *("max_lateral_acceleration", "lane_tolerance", "graded_cost_ttc", "merge_length"),
+            *("max_lateral_acceleration", "lane_tolerance", "graded_cost_ttc", "merge_length", "departure"),
         ),
         _is_positive,
         "a number above 0",
@@ -67,7 +67,7 @@ RULES = (
     Rule(
         (
             *("start_speed", "headway", "desired_speed", "slow_speed", "fast_speed", "merge_start", "slowdown_start"),
-            *("event_pause", "event_braking", "halt_duration", "block_pause", "block_appears"),
+            *("event_pause", "event_braking", "halt_duration", "block_pause", "block_appears", "approach"),
         ),
         _is_range,
         "two numbers from 0 on, the smaller one first",
@@ -83,7 +83,7 @@ RULES = (
         "a whole number from 1 on",
     ),
     Rule(
-        ("neighbours", "merging_cars"),
+        ("neighbours", "merging_cars", "cars_per_street"),
         lambda value: _is_whole(value, 0),
         "a whole number from 0 on",
     ),

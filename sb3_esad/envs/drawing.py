@@ -33,8 +33,9 @@ def draw_scene(scenario: Scenario) -> Image:
     origin, heading = traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error
     canvas = np.empty((*PICTURE.shape, 3), dtype=np.uint8)
     canvas[:] = GRASS
-    asphalt = [ROUTE if on_route else ASPHALT for on_route in scenario.route.contains[markings.lane]]
-    PICTURE.fill([canvas] * len(asphalt), PICTURE.pixels(markings.surfaces, origin, heading), asphalt)
+    surfaces, on_route = markings.with_route_on_top(scenario.route.contains)
+    asphalt = [ROUTE if on else ASPHALT for on in on_route]
+    PICTURE.fill([canvas] * len(asphalt), PICTURE.pixels(surfaces, origin, heading), asphalt)
     lines = PICTURE.pixels(markings.lines, origin, heading)
     PICTURE.lines(canvas, lines, [PAINT] * len(lines), 2)
     boxes = PICTURE.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)

@@ -20,7 +20,7 @@ class Markings:
     """
     What a drawing shows of a road, in metres.
 
-    :param surfaces: convex pieces of asphalt with four corners each, drawn in this order, shape ``(p, 4, 2)``
+    :param surfaces: convex pieces of asphalt with four corners each, shape ``(p, 4, 2)``
     :param lane: index of a lane that runs along each piece, shape ``(p,)``
     :param lines: painted lines and single dashes from point to point, fixed to the ground, shape ``(n, 2, 2)``
     :param dashed: whether each is a dash, shape ``(n,)``
@@ -30,6 +30,17 @@ class Markings:
     lane: Ints
     lines: Floats
     dashed: Bools
+
+    def with_route_on_top(self, route: Bools) -> tuple[Floats, Bools]:
+        """
+        Order the pieces of asphalt for drawing.
+
+        :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
+        :return: ``surfaces``, and whether each belongs to the route, these last
+        """
+        on_route = route[self.lane]
+        order = np.argsort(on_route, kind="stable")
+        return self.surfaces[order], on_route[order]
 
 
 class Road:
