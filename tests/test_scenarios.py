@@ -18,7 +18,6 @@ from sb3_esad.envs.highway import Highway
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.envs.negotiation import TrafficNegotiation, crossroads
 from sb3_esad.envs.obstacles import NOWHERE, ObstacleAvoidance
-from sb3_esad.envs.right_of_way import crossing
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 
@@ -158,8 +157,8 @@ def test_obstacles_appear_suddenly_ahead_and_leave_a_way_out() -> None:
 
 
 def test_ways_through_a_junction_cross_or_not() -> None:
-    road, _, ways = crossroads()
-    crosses = crossing(road, ways)
+    road, _, ways, crossings = crossroads()
+    crosses = crossings.crosses
     headings = [road.heading[way.source] for way in ways], [road.heading[way.target] for way in ways]
     turns = np.rint(wrap_angle(headings[1] - np.array(headings[0])) / (np.pi / 2)).astype(int)
     assert sorted(turns.tolist()) == [-1] * 4 + [0] * 4 + [1] * 4

@@ -5,6 +5,8 @@ from gymnasium.envs.registration import register
 _SCENARIOS = {
     "highway": "sb3_esad.envs.highway:Highway",
     "traffic-negotiation": "sb3_esad.envs.negotiation:TrafficNegotiation",
+    "town06": "sb3_esad.envs.town:Town06",
+    "town07": "sb3_esad.envs.town:Town07",
     "obstacle-avoidance": "sb3_esad.envs.obstacles:ObstacleAvoidance",
     "braking": "sb3_esad.envs.braking:Braking",
 }

@@ -9,12 +9,12 @@ from sb3_esad.envs.network_drive import NetworkDrive
 from sb3_esad.envs.networks import Carriageway, Network, Way
 from sb3_esad.envs.pieces import Piece
 from sb3_esad.envs.population import Population
-from sb3_esad.envs.right_of_way import RightOfWay
+from sb3_esad.envs.right_of_way import Crossings, RightOfWay
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.users import User
 
 ARM_LENGTH, HALF_SIZE = 250.0, 14.0  # of the streets, and of the junction [m]
-SPEED_LIMIT, TURNING_SPEED = 12.0, 6.5  # [m/s]
+SPEED_LIMIT = 12.0  # [m/s]
 
 
 class Crossroads(NamedTuple):
@@ -24,11 +24,13 @@ class Crossroads(NamedTuple):
     :param road: its lanes
     :param arriving: lanes to the junction, one carriageway for each street
     :param ways: through the junction
+    :param crossings: of these
     """
 
     road: Road
     arriving: tuple[Carriageway, ...]
     ways: tuple[Way, ...]
+    crossings: Crossings
 
 
 @cache
@@ -45,8 +47,9 @@ def crossroads() -> Crossroads:
         away, towards = network.street([Piece(start, direction, ARM_LENGTH)], 1, 1, SPEED_LIMIT)
         leaving.append(away)
         arriving.append(towards)
-    network.junction(arriving, leaving, SPEED_LIMIT, TURNING_SPEED)
-    return Crossroads(network.road(), tuple(arriving), tuple(network.ways))
+    network.junction(arriving, leaving, SPEED_LIMIT)
+    road, ways = network.road(), tuple(network.ways)
+    return Crossroads(road, tuple(arriving), ways, Crossings(road, ways))
 
 
 class TrafficNegotiation(NetworkDrive):
@@ -59,7 +62,7 @@ class TrafficNegotiation(NetworkDrive):
 
     def _make_road(self) -> Road:
         self.crossroads = crossroads()
-        self.right_of_way = RightOfWay(self.crossroads.road, self.crossroads.ways)
+        self.right_of_way = RightOfWay(self.crossroads.crossings)
         return self.crossroads.road
 
     def _plan(self) -> tuple[list[int], float, float]:

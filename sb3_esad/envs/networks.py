@@ -13,6 +13,7 @@ from sb3_esad.envs.pieces import Piece, turning
 from sb3_esad.envs.roads import DASH_LENGTH, DASH_PERIOD, Markings, Road
 
 SIDE_TURN = math.pi / 6  # a way through a junction that turns by more than this leads to the side [rad]
+COMFORTABLE = 2.5  # nobody need take a bend with a greater acceleration to the side than this [m/s^2]
 FACET = math.pi / 18  # arcs are drawn as straight facets of at most this angle [rad]
 
 
@@ -43,11 +44,13 @@ class Way(NamedTuple):
     :param source: lane that it comes from
     :param target: lane that it leads to
     :param lanes: in between
+    :param junction: number of the junction
     """
 
     source: int
     target: int
     lanes: tuple[int, ...]
+    junction: int
 
 
 class Network:
@@ -55,6 +58,7 @@ class Network:
 
     def __init__(self) -> None:
         self.ways: list[Way] = []
+        self._junctions = 0
         self._pieces: list[Piece] = []
         self._links: list[dict[str, Any]] = []
         self._lines: list[Floats] = []
@@ -89,17 +93,18 @@ class Network:
             for place in range(count):
                 self._add(
                     piece.beside((place + 0.5) * LANE_WIDTH),
+                    speed_limit,
                     left=len(self._pieces) - 1 if place > 0 else NO_LANE,
                     right=len(self._pieces) + 1 if place < count - 1 else NO_LANE,
                     following=len(self._pieces) + count if number < len(pieces) - 1 else NO_LANE,
-                    speed_limit=speed_limit,
                 )
             self._mark(piece, count)
         return Carriageway(tuple(tuple(range(first + place, len(self._pieces), count)) for place in range(count)))
 
-    def _add(self, piece: Piece, **links: Any) -> None:
+    def _add(self, piece: Piece, speed_limit: float, **links: int) -> None:
+        in_bends = math.sqrt(COMFORTABLE / max(abs(piece.curvature), 1e-6))
         self._pieces.append(piece)
-        self._links.append(links)
+        self._links.append({**links, "speed_limit": min(speed_limit, in_bends)})
 
     def _mark(self, piece: Piece, count: int) -> None:
         self._lines += [facets(piece.beside(across)) for across in (0.0, count * LANE_WIDTH)]
@@ -114,7 +119,7 @@ class Network:
 
         :param source: index of the lane that ends
         :param target: index of the lane that starts
-        :param speed_limit: [m/s]
+        :param speed_limit: lower where it turns sharply [m/s]
         :return: the way
         :raises ValueError: if no arc leads there
         """
@@ -123,40 +128,38 @@ class Network:
         pieces = turning((x, y), end.heading_at(end.length), start.start, start.heading)
         first = len(self._pieces)
         for number, piece in enumerate(pieces, 1):
-            self._add(piece, following=first + number if number < len(pieces) else target, speed_limit=speed_limit)
+            self._add(piece, speed_limit, following=first + number if number < len(pieces) else target)
         if self._links[source]["following"] == NO_LANE:
             self._links[source]["following"] = first
-        way = Way(source, target, tuple(range(first, len(self._pieces))))
+        way = Way(source, target, tuple(range(first, len(self._pieces))), self._junctions)
         self.ways.append(way)
         return way
 
-    def junction(
-        self, arriving: Sequence[Carriageway], leaving: Sequence[Carriageway], speed_limit: float, turning_speed: float
-    ) -> None:
+    def junction(self, arriving: Sequence[Carriageway], leaving: Sequence[Carriageway], speed_limit: float) -> None:
         """
         Lead from every street to every other one: to the right from the rightmost lane, to the left from the leftmost.
 
+        Where only two streets meet, every lane leads on.
+
         :param arriving: lanes that end here, one carriageway for each street
         :param leaving: lanes that start here, in the same order
-        :param speed_limit: on the ways straight on [m/s]
-        :param turning_speed: on the ways to the side [m/s]
+        :param speed_limit: [m/s]
         :raises ValueError: if a street cannot be reached by an arc
         """
+        self._junctions += 1
         for number, coming in enumerate(arriving):
             for other, going in enumerate(leaving):
                 if other != number:
-                    self._lead(coming, going, speed_limit, turning_speed)
+                    for source, target in self._lanes_to_join(coming, going, len(arriving) == 2):
+                        self.connect(source, target, speed_limit)
 
-    def _lead(self, coming: Carriageway, going: Carriageway, speed_limit: float, turning_speed: float) -> None:
+    def _lanes_to_join(self, coming: Carriageway, going: Carriageway, is_bend: bool) -> list[tuple[int, int]]:
         end, start = self._pieces[coming.exits[0]], self._pieces[going.entries[0]]
         turn = math.remainder(start.heading - end.heading_at(end.length), 2 * math.pi)
-        if turn > SIDE_TURN:
-            self.connect(coming.exits[-1], going.entries[-1], turning_speed)
-        elif turn < -SIDE_TURN:
-            self.connect(coming.exits[0], going.entries[0], turning_speed)
-        else:
-            for source, target in zip(coming.exits, going.entries, strict=False):
-                self.connect(source, target, speed_limit)
+        if is_bend or abs(turn) <= SIDE_TURN:
+            return list(zip(coming.exits, going.entries, strict=False))
+        side = -1 if turn > 0 else 0
+        return [(coming.exits[side], going.entries[side])]
 
     def road(self) -> Road:
         """
@@ -179,7 +182,7 @@ def facets(piece: Piece) -> Floats:
     :param piece: straight or an arc
     :return: from point to point, shape ``(n, 2, 2)`` [m]
     """
-    count = max(1, math.ceil(abs(piece.curvature) * piece.length / FACET))
+    count = max(1, math.ceil(abs(piece.curvature) * piece.length / FACET - 1e-6))
     points = np.array([piece.position(piece.length * index / count) for index in range(count + 1)])
     return np.stack([points[:-1], points[1:]], axis=1)
 

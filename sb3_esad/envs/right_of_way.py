@@ -14,22 +14,33 @@ ZONE = 25.0  # from here on one queues up [m]
 APART = 3.0  # ways whose centre lines come nearer to each other than this cannot be driven at the same time [m]
 
 
-class RightOfWay:
+class Crossings:
     """
-    Lets road users wait at the line before a junction while others are on, or will be first on, a way that crosses theirs.
-
-    All users queue, the ego vehicle too, but what it does is its own affair.
+    Which ways through junctions cross.
 
     :param road: the lanes
     :param ways: through all junctions
     """
 
     def __init__(self, road: Road, ways: Sequence[Way]) -> None:
-        self._ways = ways
-        self._way_of = np.full(len(road.length), NO_LANE)
+        self.way_of = np.full(len(road.length), NO_LANE)
+        """The way that each lane belongs to, ``NO_LANE`` outside junctions, shape ``(lanes,)``."""
         for number, way in enumerate(ways):
-            self._way_of[list(way.lanes)] = number
-        self._crosses = crossing(road, ways)
+            self.way_of[list(way.lanes)] = number
+        self.crosses = crossing(road, ways)
+
+
+class RightOfWay:
+    """
+    Lets road users wait at the line before a junction while others are on, or will be first on, a way that crosses theirs.
+
+    All users queue, the ego vehicle too, but what it does is its own affair.
+
+    :param crossings: of the road
+    """
+
+    def __init__(self, crossings: Crossings) -> None:
+        self._way_of, self._crosses = crossings.way_of, crossings.crosses
         self._queue: dict[int, int] = {}
 
     def regulate(self, traffic: Traffic) -> None:
@@ -79,10 +90,10 @@ def crossing(road: Road, ways: Sequence[Way]) -> Bools:
     points = [np.concatenate([_points(road, lane) for lane in way.lanes]) for way in ways]
     crosses = np.zeros((len(ways), len(ways)), dtype=bool)
     for first, own in enumerate(ways):
-        for second in range(first):
-            apart = points[first][:, None] - points[second][None]
-            near = np.hypot(apart[..., 0], apart[..., 1]).min() < APART
-            crosses[first, second] = crosses[second, first] = near and own.source != ways[second].source
+        for second, other in enumerate(ways[:first]):
+            if own.junction == other.junction and own.source != other.source:
+                apart = points[first][:, None] - points[second][None]
+                crosses[first, second] = crosses[second, first] = np.hypot(apart[..., 0], apart[..., 1]).min() < APART
     return crosses
 
 

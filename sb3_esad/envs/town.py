@@ -1,0 +1,99 @@
+"""A drive through a town, from anywhere to anywhere."""
+
+from typing import Any, ClassVar
+
+from sb3_esad.envs.network_drive import NetworkDrive
+from sb3_esad.envs.population import Population
+from sb3_esad.envs.right_of_way import RightOfWay
+from sb3_esad.envs.roads import Road
+from sb3_esad.envs.towns import Town, town
+from sb3_esad.envs.users import User
+
+SPAWNS = ("random", "fixed")
+APART = 14.0  # nobody is placed nearer to someone else of the same lane than this [m]
+
+
+class TownDrive(NetworkDrive):
+    """
+    Drive along a route of some hundred metres, with turns as drawn at the start. See :class:`Scenario`.
+
+    ``town_name`` tells the map.
+    """
+
+    town_name: ClassVar[str]
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """See :meth:`Scenario.default_config`."""
+        return {
+            **super().default_config(),
+            "duration": 90.0,
+            "route_length": 300.0,
+            "cars": 30,
+            "spawn": "random",
+        }
+
+    def _make_road(self) -> Road:
+        self.town: Town = town(self.town_name)
+        self.right_of_way = RightOfWay(self.town.crossings)
+        return self.town.road
+
+    def _plan(self) -> tuple[list[int], float, float]:
+        first, start = self._draw_place(1 if self.config["spawn"] == "fixed" else len(self.town.streets))
+        lanes = self._walk(first, self.config["route_length"] + start)
+        before = sum(float(self.road.length[lane]) for lane in lanes[:-1])
+        return lanes, start, min(self.config["route_length"] + start - before, float(self.road.length[lanes[-1]]))
+
+    def _draw_place(self, streets: int) -> tuple[int, float]:
+        """A place on one of the first streets: a lane, and the distance from its start [m]."""
+        random = self.np_random
+        street = self.town.streets[int(random.integers(streets))]
+        lane = street[int(random.integers(2))].lanes
+        pieces = lane[int(random.integers(len(lane)))]
+        piece = pieces[int(random.integers(len(pieces)))]
+        return piece, float(random.uniform(0.1, 0.7) * self.road.length[piece])
+
+    def _walk(self, lane: int, metres: float) -> list[int]:
+        """Lanes one after the other, with ways through junctions as they come, until they are long enough."""
+        lanes, length = [lane], float(self.road.length[lane])
+        while length < metres:
+            ways = [way for way in self.town.ways if way.source == lanes[-1]]
+            if ways:
+                way = ways[int(self.np_random.integers(len(ways)))]
+                following = [*way.lanes, way.target]
+            else:
+                following = [int(self.road.following[lanes[-1]])]
+            lanes += following
+            length += sum(float(self.road.length[each]) for each in following)
+        return lanes
+
+    def _place_others(self, population: Population) -> list[User]:
+        config, cars = self.config, []
+        taken: dict[int, list[float]] = {}
+        for _ in range(config["cars"]):
+            lane, along = self._draw_place(len(self.town.streets))
+            near = any(abs(along - other) < APART for other in taken.get(lane, []))
+            if near or not self._is_clear(lane, along):
+                continue
+            taken.setdefault(lane, []).append(along)
+            path = tuple(self._walk(lane, 600.0))
+            desired = float(self.np_random.uniform(*config["desired_speed"]))
+            cars.append(population.car(lane, along, 0.6 * desired, desired, population.temper(), path))
+        return cars
+
+
+class Town06(TownDrive):
+    """Long streets of two lanes in either direction, in a grid. See :class:`TownDrive`."""
+
+    town_name = "town06"
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """See :meth:`Scenario.default_config`."""
+        return {**super().default_config(), "target_speed": 14.0, "max_speed": 18.0, "cars": 45, "desired_speed": (9.0, 14.0)}
+
+
+class Town07(TownDrive):
+    """Winding two-way roads around a lake. See :class:`TownDrive`."""
+
+    town_name = "town07"
