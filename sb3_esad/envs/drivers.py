@@ -11,6 +11,8 @@ from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 
 HEADING_GAIN, LATERAL_GAIN = 2.5, 0.7  # gentler than the traffic's, for who decides 5 times a second [1/s]
+GET_BACK = 100.0  # from here on to the end of a lane it is time to be on the lane that leads on [m]
+FALL_BACK = 2.0  # gently [m/s^2]
 CREEP_SPEED, CREEP_ROOM = 3.0, 6.5  # [m/s], between centres [m]
 SETTLED_OFFSET, SETTLED_HEADING = 0.5, 0.05  # a lane change is over within these [m], [rad]
 _SELF = np.array([EGO])
@@ -91,13 +93,24 @@ class ReferenceDriver(CarFollower):
         return self._target
 
     def _acceleration(self, scenario: Scenario, lane: int) -> float:
-        """Who stands behind an obstacle gets out of its lane at a walking pace, for to follow the obstacle is to stay."""
+        """Fall back behind who is in the way of getting back; get out from behind an obstacle at a walking pace."""
         traffic, wanted = scenario.traffic, super()._acceleration(scenario, lane)
-        own_lane, speed = int(traffic.lane[EGO]), float(traffic.speed[EGO])
-        front = traffic.front[:1]
-        if lane == own_lane or front[0] < 0 or traffic.speed[front[0]] > 0 or traffic.distance(_SELF, front)[0] < CREEP_ROOM:
-            return wanted
-        return max(wanted, min(CREEP_SPEED - speed, self._following(scenario, lane)))
+        own_lane = int(traffic.lane[EGO])
+        if lane == own_lane and self._must_get_back(scenario, lane):
+            return min(wanted, max(self._following(scenario, int(scenario.route.back[lane])), -FALL_BACK))
+        if lane != own_lane and self._is_behind_obstacle(scenario):  # to follow the obstacle would be to stay
+            return max(wanted, min(CREEP_SPEED - float(traffic.speed[EGO]), self._following(scenario, lane)))
+        return wanted
+
+    @staticmethod
+    def _is_behind_obstacle(scenario: Scenario) -> bool:
+        traffic, front = scenario.traffic, scenario.traffic.front[:1]
+        return front[0] >= 0 and traffic.speed[front[0]] == 0 and traffic.distance(_SELF, front)[0] >= CREEP_ROOM
+
+    @staticmethod
+    def _must_get_back(scenario: Scenario, lane: int) -> bool:
+        left = scenario.road.length[lane] - scenario.traffic.along[lane, EGO]
+        return len(scenario.route.lanes) > 1 and scenario.route.contains[lane] and left < GET_BACK
 
     @staticmethod
     def _is_settled(scenario: Scenario, lane: int) -> bool:
@@ -108,6 +121,9 @@ class ReferenceDriver(CarFollower):
     @staticmethod
     def _best_lane(scenario: Scenario, lane: int) -> int:
         road, traffic, route = scenario.road, scenario.traffic, scenario.route
+        if ReferenceDriver._must_get_back(scenario, lane):
+            back = int(route.back[lane])
+            return back if traffic.change_is_safe(_SELF, np.array([back]))[0] else lane
         beside = [int(each) for each in (road.left[lane], road.right[lane]) if each != NO_LANE and route.contains[each]]
         worth = [each for each in beside if traffic.change_is_worth_it(_SELF, np.array([each]))[0]]
         return max(worth, key=lambda each: CarFollower._following(scenario, each)) if worth else lane

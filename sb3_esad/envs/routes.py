@@ -4,7 +4,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_esad.envs.roads import Road
+from sb3_esad.envs.lanes import NO_LANE
+from sb3_esad.envs.roads import Ints, Road
 
 
 class Route:
@@ -22,13 +23,22 @@ class Route:
         self.contains = np.zeros(len(road.length), dtype=bool)
         self._before = np.zeros(len(road.length))
         self._stretch = np.ones(len(road.length))
+        self.back = np.arange(len(road.length))
+        """The lane to change to from each lane in order to get back to ``lanes``, the lane itself elsewhere."""
         metres = -start
         for lane in lanes:
             for each in road.with_lanes_beside([lane]):
                 self.contains[each] = True
                 self._before[each], self._stretch[each] = metres, road.length[lane] / road.length[each]
+            self._lead_back(lane, road.left)
+            self._lead_back(lane, road.right)
             metres += float(road.length[lane])
         self.length = metres - float(road.length[lanes[-1]]) + end
+
+    def _lead_back(self, lane: int, beside: Ints) -> None:
+        while beside[lane] != NO_LANE:
+            self.back[beside[lane]] = lane
+            lane = int(beside[lane])
 
     def progress(self, lane: int, along: float) -> float:
         """

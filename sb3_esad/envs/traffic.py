@@ -99,6 +99,19 @@ class Traffic(RoadUsers):
         stopping = free - acceleration * (wanted / np.maximum(distance, 0.1)) ** 2
         return np.where(distance < np.inf, stopping, np.inf)
 
+    def change_is_safe(self, rows: Ints, lanes: Ints) -> Bools:
+        """
+        Whether the new follower could brake gently enough if users changed lane, and they themselves.
+
+        :param rows: the users who must change, shape ``(n,)``
+        :param lanes: the lane each changes to, shape ``(n,)``
+        :return: one verdict per user, shape ``(n,)``
+        """
+        front, rear = self.neighbours(rows, lanes)
+        limit = -self.temper["imposed_braking"][rows]
+        behind, own = self.following_acceleration(rear, rows, rows), self.following_acceleration(rows, front, rows)
+        return (behind >= limit) & (own >= limit)
+
     def change_is_worth_it(self, rows: Ints, lanes: Ints) -> Bools:
         """
         Whether MOBIL recommends a lane change: safe for the new follower, and of advantage to those concerned.
