@@ -15,6 +15,7 @@ VIEW = View(SHAPE, SCALE, AHEAD)
 BEV = BirdsEyeView(VIEW)
 ROAD = highway_road(3, 600.0, 200.0, 150.0)
 ROUTE = np.array([True, True, True, False, False])
+NO_LINES = np.zeros((0, 4, 2))
 
 
 def scene(*users: User) -> Traffic:
@@ -29,7 +30,7 @@ def ego(x: float = 50.0, y: float = 4.0, heading: float = 0.0, speed: float = 25
 
 def see(*users: User, markings: Markings = ROAD.markings, heading: float = 0.0) -> np.ndarray:
     """Image of a scene as signed numbers."""
-    return BEV.draw(markings, ROUTE, scene(*users), heading).astype(int)
+    return BEV.draw(markings, ROUTE, scene(*users), NO_LINES, heading).astype(int)
 
 
 @pytest.mark.parametrize("frame", ["lane", "ego"])
@@ -121,7 +122,7 @@ def test_an_empty_world_is_black_but_for_the_ego_vehicle() -> None:
 
 def test_other_sizes_and_scales() -> None:
     view = View((96, 48), (1.0, 0.5), 0.75)
-    image = BirdsEyeView(view).draw(ROAD.markings, ROUTE, scene(ego()), 0.0)
+    image = BirdsEyeView(view).draw(ROAD.markings, ROUTE, scene(ego()), NO_LINES, 0.0)
     assert image.shape == (3, 96, 48)
     assert image.dtype == np.uint8
     assert np.flatnonzero(image[2][:, 4:-4].any(1)).mean() == pytest.approx(96 * 0.75 - 0.5, abs=1.0)

@@ -7,6 +7,7 @@ _SCENARIOS = {
     "traffic-negotiation": "sb3_esad.envs.negotiation:TrafficNegotiation",
     "town06": "sb3_esad.envs.town:Town06",
     "town07": "sb3_esad.envs.town:Town07",
+    "town10": "sb3_esad.envs.town:Town10",
     "obstacle-avoidance": "sb3_esad.envs.obstacles:ObstacleAvoidance",
     "braking": "sb3_esad.envs.braking:Braking",
 }

@@ -145,13 +145,14 @@ class BirdsEyeView:
     def __init__(self, view: View) -> None:
         self.view = view
 
-    def draw(self, markings: Markings, route: Bools, traffic: Traffic, heading: float) -> Image:
+    def draw(self, markings: Markings, route: Bools, traffic: Traffic, red_lines: Floats, heading: float) -> Image:
         """
         Draw the surroundings of the ego vehicle.
 
         :param markings: of the road
         :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
         :param traffic: all road users
+        :param red_lines: corners of the lines before red lights, shape ``(n, 4, 2)`` [m]
         :param heading: the direction that points up [rad]
         :return: the image, shape ``(3, rows, columns)``
         """
@@ -163,9 +164,11 @@ class BirdsEyeView:
         moves[EGO] = False
         surfaces, on_route = markings.with_route_on_top(route)
         asphalt = view.pixels(surfaces, origin, heading)
-        boxes = inset(view.pixels(corners, origin, heading))
-        layers = [road] * len(asphalt) + [users if moving else obstacles for moving in moves]
-        greys = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist() + user_greys(traffic)
+        boxes = inset(view.pixels(np.concatenate([red_lines, corners]), origin, heading))
+        layers = [road] * len(asphalt) + [obstacles] * len(red_lines) + [users if moving else obstacles for moving in moves]
+        greys = (
+            np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist() + [OBSTACLE_GREY] * len(red_lines) + user_greys(traffic)
+        )
         view.fill(layers, np.concatenate([asphalt, boxes]), greys)
         paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
         view.lines(road, view.pixels(markings.lines, origin, heading), paint)

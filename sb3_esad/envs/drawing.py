@@ -18,6 +18,7 @@ Colour = tuple[int, int, int]
 PICTURE = View((960, 320), (1 / 8, 1 / 8), 0.75)
 GRASS, ASPHALT, ROUTE, PAINT = (44, 62, 48), (70, 70, 74), (92, 92, 98), (225, 225, 225)
 EGO_COLOUR, CRASH_COLOUR, STATIC_COLOUR, PERSON_COLOUR = (64, 220, 110), (235, 60, 50), (240, 150, 40), (240, 90, 200)
+RED = (220, 40, 40)
 SLOW_COLOUR, FAST_COLOUR = np.array([60.0, 90.0, 170.0]), np.array([130.0, 200.0, 255.0])
 FASTEST = 30.0  # [m/s]
 
@@ -38,6 +39,8 @@ def draw_scene(scenario: Scenario) -> Image:
     PICTURE.fill([canvas] * len(asphalt), PICTURE.pixels(surfaces, origin, heading), asphalt)
     lines = PICTURE.pixels(markings.lines, origin, heading)
     PICTURE.lines(canvas, lines, [PAINT] * len(lines), 2)
+    red = PICTURE.pixels(scenario.red_lines, origin, heading)
+    PICTURE.fill([canvas] * len(red), red, [RED] * len(red))
     boxes = PICTURE.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)
     PICTURE.fill([canvas] * len(boxes), boxes, [_colour(scenario, row) for row in range(len(boxes))])
     picture = np.ascontiguousarray(np.rot90(canvas, -1))

@@ -33,6 +33,10 @@ class Scene(Protocol):
         """Angle from the lane to the ego vehicle [rad]."""
 
     @property
+    def red_lines(self) -> Floats:
+        """Corners of the lines before red lights, shape ``(n, 4, 2)`` [m]."""
+
+    @property
     def remaining(self) -> float:
         """Share of the route that lies ahead."""
 
@@ -70,7 +74,7 @@ class ImageObservation:
         """See :meth:`Observation.observe`."""
         traffic = scene.traffic
         heading = traffic.heading[EGO] - (scene.heading_error if self._frame == "lane" else 0.0)
-        return self._bev.draw(scene.road.markings, scene.route.contains, traffic, heading)
+        return self._bev.draw(scene.road.markings, scene.route.contains, traffic, scene.red_lines, heading)
 
 
 class EgoObservation:

@@ -43,13 +43,14 @@ class RightOfWay:
         self._way_of, self._crosses = crossings.way_of, crossings.crosses
         self._queue: dict[int, int] = {}
 
-    def regulate(self, traffic: Traffic) -> None:
+    def regulate(self, traffic: Traffic, red: Bools | None = None) -> None:
         """
         Tell everybody where to stop.
 
         :param traffic: all road users; ``stop_distance`` is set
+        :param red: whether each way has a red light; who waits there is in nobody's way
         """
-        places = {row: place for row in range(len(traffic.speed)) if (place := self._place(traffic, row))}
+        places = {row: place for row in range(len(traffic.speed)) if (place := self.way_ahead(traffic, row))}
         queue = {row: way for row, way in self._queue.items() if row in places and places[row][0] == way}
         newcomers = sorted((distance, row) for row, (_, distance) in places.items() if row not in queue)
         queue |= {row: places[row][0] for _, row in newcomers}
@@ -59,12 +60,21 @@ class RightOfWay:
         traffic.stop_distance[:] = np.inf
         before: list[int] = []
         for row, way in self._queue.items():
-            if places[row][1] > 0 and self._crosses[way, before].any():
+            outside = places[row][1] > 0
+            must_stop = outside and red is not None and red[way]
+            if must_stop or (outside and self._crosses[way, before].any()):
                 traffic.stop_distance[row] = places[row][1]
-            before.append(way)
+            if not must_stop:
+                before.append(way)
 
-    def _place(self, traffic: Traffic, row: int) -> tuple[int, float] | None:
-        """The way that a user is on, or comes to next, and how far it is from the line, at most 0 on the way."""
+    def way_ahead(self, traffic: Traffic, row: int) -> tuple[int, float] | None:
+        """
+        Find the way that a user is on or comes to next.
+
+        :param traffic: all road users
+        :param row: the user
+        :return: number of the way, and the distance from the line before it, at most 0 on the way [m]; None if it is far
+        """
         lane = int(traffic.lane[row]) if row in traffic.outsiders else int(traffic.target_lane[row])
         distance = -float(traffic.along[lane, row])
         for _ in range(LOOKAHEAD):

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from sb3_esad.envs.geometry import Floats
-from sb3_esad.envs.lanes import CAR_LENGTH, NO_LANE
+from sb3_esad.envs.lanes import CAR_LENGTH, LANE_WIDTH, NO_LANE
 from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Kind, User
 
@@ -69,7 +69,10 @@ class RoadUsers:
         within = np.abs(self.across) <= road.width[:, None] / 2 + self._margin
         self.present = within & (road.overshoot(self.along) <= CAR_LENGTH)
         # Others make room for a user that they do not steer in the lane where it will soon be, too.
-        self.present[self.target_lane[self.outsiders], self.outsiders] = True
+        # People beside the road are in nobody's way.
+        soon_off = across[lane[count:], np.arange(count, len(lane))]
+        heading_for = (self.kind[self.outsiders] != Kind.PERSON) | (np.abs(soon_off) <= LANE_WIDTH / 2)
+        self.present[self.target_lane[self.outsiders[heading_for]], self.outsiders[heading_for]] = True
         self.reach, there = self.look_ahead(self._rows, self.lane)
         self.front, self.rear = self._nearest(self._rows, self.reach, there)
 

@@ -9,7 +9,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_esad.envs.config import check_config, merge_config
-from sb3_esad.envs.geometry import wrap_angle
+from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
@@ -142,6 +142,11 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         lane = traffic.lane[:1]
         along_lane = self.road.heading_at(lane, traffic.along[lane, EGO])
         return float(wrap_angle(traffic.heading[EGO] - along_lane)[0])
+
+    @property
+    def red_lines(self) -> Floats:
+        """Corners of the lines before red lights, shape ``(n, 4, 2)`` [m]."""
+        return np.zeros((0, 4, 2))
 
     @property
     def remaining(self) -> float:

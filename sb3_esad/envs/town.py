@@ -2,14 +2,23 @@
 
 from typing import Any, ClassVar
 
+import numpy as np
+
+from sb3_esad.envs.geometry import Floats
+from sb3_esad.envs.lanes import LANE_WIDTH
+from sb3_esad.envs.lights import ALL_RED, GREEN, TrafficLights
 from sb3_esad.envs.network_drive import NetworkDrive
 from sb3_esad.envs.population import Population
 from sb3_esad.envs.right_of_way import RightOfWay
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.towns import Town, town
-from sb3_esad.envs.users import User
+from sb3_esad.envs.users import Kind, User
+from sb3_esad.envs.walkers import Walkers
 
 SPAWNS = ("random", "fixed")
+PERSON_SIZE = (0.6, 0.6)  # [m]
+CROSSING, KERB = 4.0, 2.0  # people cross this far before the line, from this far beside the road [m]
 APART = 14.0  # nobody is placed nearer to someone else of the same lane than this [m]
 
 
@@ -82,6 +91,54 @@ class TownDrive(NetworkDrive):
         return cars
 
 
+class LitTown(TownDrive):
+    """A town with traffic lights, and people who cross its streets. See :class:`TownDrive`."""
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """See :meth:`Scenario.default_config`."""
+        return {**super().default_config(), "people": 16, "walking_speed": 1.2, "walking_pause": (2.0, 12.0)}
+
+    def _make_road(self) -> Road:
+        road = super()._make_road()
+        junctions = max(way.junction for way in self.town.ways)
+        self.lights = TrafficLights(road, self.town.ways, self.np_random.uniform(0.0, 2 * (GREEN + ALL_RED), junctions))
+        return road
+
+    def _place_others(self, population: Population) -> list[User]:
+        cars, config = super()._place_others(population), self.config
+        ends = np.array([self._draw_crossing() for _ in range(config["people"])]).reshape(-1, 2, 2)
+        people = [User(tuple(start), kind=Kind.PERSON, drives=False, size=PERSON_SIZE) for start, _ in ends.tolist()]
+        rows = 1 + len(cars) + np.arange(len(people))
+        self.walkers = Walkers(self.np_random, rows, ends, config["walking_speed"], config["walking_pause"])
+        return [*cars, *people]
+
+    def _draw_crossing(self) -> list[Floats]:
+        """Two places on either side of a street, just before a junction, in any order."""
+        street = self.town.streets[int(self.np_random.integers(len(self.town.streets)))]
+        there = street[int(self.np_random.integers(2))].exits[-1]
+        along, lanes = float(self.road.length[there]) - CROSSING, len(street[0].lanes)
+        far = (2 * lanes - 0.5) * LANE_WIDTH + KERB
+        sides = [self.road.position(there, along, LANE_WIDTH / 2 + KERB), self.road.position(there, along, -far)]
+        return sides[:: int(self.np_random.choice([-1, 1]))]
+
+    def _before_physics(self) -> None:
+        self._red = self.lights.red(self.episode.time)
+        self._way = self.right_of_way.way_ahead(self.traffic, EGO)
+        self.right_of_way.regulate(self.traffic, self._red)
+        self.walkers.walk(self.traffic, self.episode.time)
+
+    def _ran_red_light(self) -> bool:
+        ahead, now = self._way, self.right_of_way.way_ahead(self.traffic, EGO)
+        entered = ahead is not None and now is not None and ahead[0] == now[0] and ahead[1] > 0 >= now[1]
+        return entered and bool(self._red[now[0]])
+
+    @property
+    def red_lines(self) -> Floats:
+        """See :attr:`Scenario.red_lines`."""
+        return self.lights.red_lines(self.episode.time)
+
+
 class Town06(TownDrive):
     """Long streets of two lanes in either direction, in a grid. See :class:`TownDrive`."""
 
@@ -97,3 +154,9 @@ class Town07(TownDrive):
     """Winding two-way roads around a lake. See :class:`TownDrive`."""
 
     town_name = "town07"
+
+
+class Town10(LitTown):
+    """The dense centre of a town: many junctions with lights, people on crossings. See :class:`LitTown`."""
+
+    town_name = "town10"

@@ -95,7 +95,10 @@ TOWN07 = TownMap(
 )
 """Winding roads around a lake, and one over its dam."""
 
-MAPS = {"town06": TOWN06, "town07": TOWN07}
+TOWN10 = grid(4, 4, 95.0, 85.0, lanes=1, speed_limit=11.0, half_size=14.0)
+"""Many junctions close to each other."""
+
+MAPS = {"town10": TOWN10, "town06": TOWN06, "town07": TOWN07}
 
 
 @cache
