@@ -166,9 +166,8 @@ class BirdsEyeView:
         asphalt = view.pixels(surfaces, origin, heading)
         boxes = inset(view.pixels(np.concatenate([red_lines, corners]), origin, heading))
         layers = [road] * len(asphalt) + [obstacles] * len(red_lines) + [users if moving else obstacles for moving in moves]
-        greys = (
-            np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist() + [OBSTACLE_GREY] * len(red_lines) + user_greys(traffic)
-        )
+        greys = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist()
+        greys += [OBSTACLE_GREY] * len(red_lines) + user_greys(traffic)
         view.fill(layers, np.concatenate([asphalt, boxes]), greys)
         paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
         view.lines(road, view.pixels(markings.lines, origin, heading), paint)

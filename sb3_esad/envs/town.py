@@ -97,7 +97,13 @@ class LitTown(TownDrive):
     @classmethod
     def default_config(cls) -> dict[str, Any]:
         """See :meth:`Scenario.default_config`."""
-        return {**super().default_config(), "people": 16, "walking_speed": 1.2, "walking_pause": (2.0, 12.0)}
+        return {
+            **super().default_config(),
+            "duration": 150.0,
+            "people": 16,
+            "walking_speed": 1.2,
+            "walking_pause": (2.0, 12.0),
+        }
 
     def _make_road(self) -> Road:
         road = super()._make_road()
@@ -130,8 +136,9 @@ class LitTown(TownDrive):
 
     def _ran_red_light(self) -> bool:
         ahead, now = self._way, self.right_of_way.way_ahead(self.traffic, EGO)
-        entered = ahead is not None and now is not None and ahead[0] == now[0] and ahead[1] > 0 >= now[1]
-        return entered and bool(self._red[now[0]])
+        if ahead is None or now is None or ahead[0] != now[0]:
+            return False
+        return ahead[1] > 0 >= now[1] and bool(self._red[now[0]])
 
     @property
     def red_lines(self) -> Floats:
