@@ -248,7 +248,7 @@ def test_speed_and_acceleration_limits() -> None:
 
 @pytest.mark.parametrize("speed", [3.0, 10.0, 20.0, 30.0])
 def test_steering_is_limited_by_wheel_angle_and_lateral_acceleration(speed: float) -> None:
-    controls = Controls(3.0, 6.0, 0.5, 4.0, 30.0)
+    controls = Controls(3.0, 6.0, 0.5, 4.0, 30.0, (5.0, 2.0))
     _, angle = controls.decode(np.array([0.0, 1.0]), speed)
     yaw_rate = speed * np.sin(np.arctan(0.5 * np.tan(angle))) / 2.5
     assert angle <= 0.5 + 1e-9
@@ -259,7 +259,7 @@ def test_steering_is_limited_by_wheel_angle_and_lateral_acceleration(speed: floa
 @given(pedal=st.floats(-1, 1), wheel=st.floats(-1, 1), speed=st.floats(0, 30))
 @settings(max_examples=100, deadline=None)
 def test_encode_inverts_decode(pedal: float, wheel: float, speed: float) -> None:
-    controls = Controls(3.0, 6.0, 0.5, 4.0, 30.0)
+    controls = Controls(3.0, 6.0, 0.5, 4.0, 30.0, (5.0, 2.0))
     action = np.array([pedal, wheel])
     np.testing.assert_allclose(controls.encode(*controls.decode(action, speed), speed), action, atol=1e-6)
 

@@ -9,6 +9,10 @@ _SCENARIOS = {
     "town07": "sb3_esad.envs.town:Town07",
     "town10": "sb3_esad.envs.town:Town10",
     "obstacle-avoidance": "sb3_esad.envs.obstacles:ObstacleAvoidance",
+    "course": "sb3_esad.envs.course:Course",
+    "course-1mps": "sb3_esad.envs.course:Course1",
+    "course-2mps": "sb3_esad.envs.course:Course2",
+    "course-3mps": "sb3_esad.envs.course:Course3",
     "braking": "sb3_esad.envs.braking:Braking",
 }
 _OBSERVATIONS = {"": "image", "-vector": "vector", "-dict": "dict"}

@@ -43,7 +43,15 @@ RULES = (
     Rule(
         (
             *("duration", "route_length", "target_speed", "max_speed", "max_acceleration", "max_braking", "max_wheel_angle"),
-            *("max_lateral_acceleration", "lane_tolerance", "graded_cost_ttc", "merge_length", "departure"),
+            *(
+                "max_lateral_acceleration",
+                "lane_tolerance",
+                "graded_cost_ttc",
+                "merge_length",
+                "departure",
+                "walking_speed",
+                "hall_width",
+            ),
         ),
         _is_positive,
         "a number above 0",
@@ -67,13 +75,24 @@ RULES = (
     Rule(
         (
             *("start_speed", "headway", "desired_speed", "slow_speed", "fast_speed", "merge_start", "slowdown_start"),
-            *("event_pause", "event_braking", "halt_duration", "block_pause", "block_appears", "approach"),
+            *(
+                "event_pause",
+                "event_braking",
+                "halt_duration",
+                "block_pause",
+                "block_appears",
+                "approach",
+                "walking_pause",
+                "box_side",
+                "course_length",
+                "obstacles",
+            ),
         ),
         _is_range,
         "two numbers from 0 on, the smaller one first",
     ),
     Rule(
-        ("image_shape", "metres_per_pixel"),
+        ("image_shape", "metres_per_pixel", "vehicle_size"),
         lambda value: np.shape(value) == (2,) and all(map(_is_positive, value)),
         "two numbers above 0, along the road and across it",
     ),
@@ -83,7 +102,7 @@ RULES = (
         "a whole number from 1 on",
     ),
     Rule(
-        ("neighbours", "merging_cars", "cars_per_street"),
+        ("neighbours", "merging_cars", "cars_per_street", "cars", "people"),
         lambda value: _is_whole(value, 0),
         "a whole number from 0 on",
     ),

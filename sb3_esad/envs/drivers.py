@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_esad.envs.course_driver import CourseDriver
 from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
@@ -79,6 +80,12 @@ class ReferenceDriver(CarFollower):
     def __init__(self) -> None:
         self._episode: object = None
         self._target = NO_LANE
+        self._where_no_lanes_are = CourseDriver()
+
+    def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
+        """See :meth:`SpeedKeeper.__call__`."""
+        scenario = scenario_of(env)
+        return super().__call__(env) if scenario.has_lanes else self._where_no_lanes_are.act(scenario)
 
     def _lane(self, scenario: Scenario) -> int:
         traffic, lane = scenario.traffic, int(scenario.traffic.lane[EGO])

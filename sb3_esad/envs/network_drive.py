@@ -57,8 +57,9 @@ class NetworkDrive(Scenario):
         population = Population(self.np_random, self.road, 0.0, none, 0.0, none, spread, config["headway"])
         x, y = self.road.position(lane, self._start).tolist()
         heading = self.road.lanes[lane].heading_at(self._start)
-        target, path = config["target_speed"], self.route.lanes
-        ego = User((x, y), heading, speed, target, drives=False, temper=self.ego_temper, path=path)
+        place, motion = {"position": (x, y), "heading": heading}, {"speed": speed, "target_speed": config["target_speed"]}
+        body = {"size": config["vehicle_size"], "temper": self.ego_temper, "path": self.route.lanes}
+        ego = User(**place, **motion, **body, drives=False)
         return Traffic(self.road, [ego, *self._place_others(population)])
 
     def _is_clear(self, lane: int, along: float) -> bool:

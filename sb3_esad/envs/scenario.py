@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from sb3_esad.envs.config import check_config, merge_config
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
+from sb3_esad.envs.lanes import CAR_LENGTH
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
 from sb3_esad.envs.rewards import DrivingReward
@@ -18,7 +19,7 @@ from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
-from sb3_esad.envs.users import Kind
+from sb3_esad.envs.users import CAR_WIDTH, Kind
 from sb3_esad.envs.vehicle import Controls
 
 
@@ -31,11 +32,14 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     ``cost_terms``, ``rewards`` (the terms by name), ``speed`` and ``crashed``; at an episode's end also ``is_success`` and
     ``driving``, the record of :class:`Episode`.
 
+    ``has_lanes`` tells whether there are lanes to keep to.
+
     :param config: overrides of :meth:`default_config`
     :param observation: ``"image"``, ``"vector"`` or ``"dict"``
     :param render_mode: ``"rgb_array"``, ``"human"`` or None
     """
 
+    has_lanes = True
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 5}  # noqa: RUF012 - typed by gymnasium
     road: Road
     route: Route
@@ -76,6 +80,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             "max_braking": 6.0,
             "max_wheel_angle": 0.5,
             "max_lateral_acceleration": 4.0,
+            "vehicle_size": (CAR_LENGTH, CAR_WIDTH),
             "reward_weights": {"velocity": 0.7, "lane": 0.2, "orientation": 0.1, "exploration": 0.0},
             "velocity_sharpness": 0.2,
             "orientation_sharpness": 5.0,

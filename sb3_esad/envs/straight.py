@@ -89,7 +89,8 @@ class StraightDrive(Scenario):
         own_lane = int(self.np_random.integers(self.lanes))
         speed = float(self.np_random.uniform(*self.config["start_speed"]))
         place, target = (0.0, own_lane * LANE_WIDTH), self.config["target_speed"]
-        ego = User(place, speed=speed, target_speed=target, drives=False, temper=self.ego_temper)
+        size, temper = self.config["vehicle_size"], self.ego_temper
+        ego = User(place, speed=speed, target_speed=target, drives=False, size=size, temper=temper)
         cars = [car for lane in range(self.lanes) for car in self._lane_traffic(lane, lane == own_lane)]
         return Traffic(self.road, [ego, *cars, *self._others()])
 

@@ -5,8 +5,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.lanes import CAR_LENGTH
-
 
 @dataclass(frozen=True)
 class Controls:
@@ -21,6 +19,7 @@ class Controls:
     :param max_wheel_angle: [rad]
     :param max_lateral_acceleration: [m/s^2]
     :param max_speed: speeds stay within 0 and this [m/s]
+    :param vehicle_size: length and width [m]
     """
 
     max_acceleration: float
@@ -28,6 +27,7 @@ class Controls:
     max_wheel_angle: float
     max_lateral_acceleration: float
     max_speed: float
+    vehicle_size: tuple[float, float]
 
     def full_lock(self, speed: float) -> float:
         """
@@ -36,7 +36,7 @@ class Controls:
         :param speed: [m/s]
         :return: [rad]
         """
-        slip = np.arcsin(min(self.max_lateral_acceleration * CAR_LENGTH / 2 / max(speed, 1e-3) ** 2, 1.0))
+        slip = np.arcsin(min(self.max_lateral_acceleration * self.vehicle_size[0] / 2 / max(speed, 1e-3) ** 2, 1.0))
         return float(min(np.arctan(2 * np.tan(slip)), self.max_wheel_angle))
 
     def decode(self, action: NDArray[np.floating], speed: float) -> tuple[float, float]:
