@@ -62,6 +62,7 @@ class Course(Scenario):
             "walking_speed": 1.0,
             "walking_pause": (0.0, 2.0),
             "vehicle_size": (1.2, 0.8),
+            "start_speed": (1.5, 2.0),
             "target_speed": 2.0,
             "max_speed": 2.5,
             "max_acceleration": 1.5,
@@ -83,7 +84,8 @@ class Course(Scenario):
     def _make_traffic(self) -> Traffic:
         config, random = self.config, self.np_random
         place = (0.0, float(random.uniform(-2.0, 2.0)))
-        ego = User(place, target_speed=config["target_speed"], drives=False, size=config["vehicle_size"])
+        speed, size = float(random.uniform(*config["start_speed"])), config["vehicle_size"]
+        ego = User(place, speed=speed, target_speed=config["target_speed"], drives=False, size=size)
         obstacles = self._place_obstacles(int(random.integers(config["obstacles"][0], config["obstacles"][1] + 1)))
         ends = self._draw_walks(obstacles)
         people = [User(tuple(start), kind=Kind.PERSON, drives=False, size=PERSON) for start, _ in ends.tolist()]
