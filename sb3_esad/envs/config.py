@@ -42,67 +42,41 @@ def _is_range(value: Any) -> bool:
 RULES = (
     Rule(
         (
-            *("duration", "route_length", "target_speed", "max_speed", "max_acceleration", "max_braking", "max_wheel_angle"),
-            *(
-                "max_lateral_acceleration",
-                "lane_tolerance",
-                "graded_cost_ttc",
-                "merge_length",
-                "departure",
-                "walking_speed",
-                "hall_width",
-            ),
-        ),
+            "duration route_length target_speed max_speed max_acceleration max_braking max_wheel_angle max_lateral_acceleration "
+            "lane_tolerance graded_cost_ttc merge_length departure walking_speed hall_width"
+        ).split(),
         _is_positive,
         "a number above 0",
     ),
     Rule(
         (
-            *("velocity_sharpness", "orientation_sharpness", "exploration_decay", "traffic_behind", "traffic_ahead"),
-            *("desired_speed_spread", "slowdown_speed", "slowdown_duration"),
-        ),
+            "velocity_sharpness orientation_sharpness exploration_decay traffic_behind traffic_ahead desired_speed_spread "
+            "slowdown_speed slowdown_duration"
+        ).split(),
         lambda value: _is_finite(value) and value >= 0,
         "a number from 0 on",
     ),
     Rule(
-        (
-            *("ahead", "slow_share", "fast_share", "slowdown_share"),
-            *("cut_in_share", "cut_in_braking_share", "second_block_share"),
-        ),
+        "ahead slow_share fast_share slowdown_share cut_in_share cut_in_braking_share second_block_share".split(),
         lambda value: _is_finite(value) and 0 <= value <= 1,
         "a share from 0 to 1",
     ),
     Rule(
         (
-            *("start_speed", "headway", "desired_speed", "slow_speed", "fast_speed", "merge_start", "slowdown_start"),
-            *(
-                "event_pause",
-                "event_braking",
-                "halt_duration",
-                "block_pause",
-                "block_appears",
-                "approach",
-                "walking_pause",
-                "box_side",
-                "course_length",
-                "obstacles",
-            ),
-        ),
+            "start_speed headway desired_speed slow_speed fast_speed merge_start slowdown_start event_pause event_braking "
+            "halt_duration block_pause block_appears approach walking_pause box_side course_length obstacles"
+        ).split(),
         _is_range,
         "two numbers from 0 on, the smaller one first",
     ),
     Rule(
-        ("image_shape", "metres_per_pixel", "vehicle_size"),
+        "image_shape metres_per_pixel vehicle_size".split(),
         lambda value: np.shape(value) == (2,) and all(map(_is_positive, value)),
         "two numbers above 0, along the road and across it",
     ),
+    Rule("physics_frequency policy_frequency".split(), lambda value: _is_whole(value, 1), "a whole number from 1 on"),
     Rule(
-        ("physics_frequency", "policy_frequency"),
-        lambda value: _is_whole(value, 1),
-        "a whole number from 1 on",
-    ),
-    Rule(
-        ("neighbours", "merging_cars", "cars_per_street", "cars", "people"),
+        "neighbours merging_cars cars_per_street cars people".split(),
         lambda value: _is_whole(value, 0),
         "a whole number from 0 on",
     ),
@@ -111,6 +85,7 @@ RULES = (
         lambda value: np.ndim(value) == 1 and len(value) > 0 and all(_is_whole(lanes, 1) for lanes in value),
         "a sequence of whole numbers from 1 on",
     ),
+    Rule(("spawn",), lambda value: value in ("random", "fixed"), "random or fixed"),
 )
 
 

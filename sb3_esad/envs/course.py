@@ -95,7 +95,7 @@ class Course(Scenario):
 
     def _place_obstacles(self, count: int) -> list[User]:
         """Boxes and cones at random places with room to pass between any two of them; fewer if the hall is full."""
-        random, placed = self.np_random, []
+        random, placed = self.np_random, list[User]()
         half = self.config["hall_width"] / 2 - WALL_GAP
         for _ in range(count * ATTEMPTS):
             side = float(random.uniform(*self.config["box_side"]))

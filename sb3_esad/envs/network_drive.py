@@ -57,9 +57,16 @@ class NetworkDrive(Scenario):
         population = Population(self.np_random, self.road, 0.0, none, 0.0, none, spread, config["headway"])
         x, y = self.road.position(lane, self._start).tolist()
         heading = self.road.lanes[lane].heading_at(self._start)
-        place, motion = {"position": (x, y), "heading": heading}, {"speed": speed, "target_speed": config["target_speed"]}
-        body = {"size": config["vehicle_size"], "temper": self.ego_temper, "path": self.route.lanes}
-        ego = User(**place, **motion, **body, drives=False)
+        ego = User(
+            position=(x, y),
+            heading=heading,
+            speed=speed,
+            target_speed=config["target_speed"],
+            drives=False,
+            size=config["vehicle_size"],
+            temper=self.ego_temper,
+            path=self.route.lanes,
+        )
         return Traffic(self.road, [ego, *self._place_others(population)])
 
     def _is_clear(self, lane: int, along: float) -> bool:

@@ -16,7 +16,6 @@ from sb3_esad.envs.towns import Town, town
 from sb3_esad.envs.users import Kind, User
 from sb3_esad.envs.walkers import Walkers
 
-SPAWNS = ("random", "fixed")
 PERSON_SIZE = (0.6, 0.6)  # [m]
 CROSSING, KERB = 4.0, 2.0  # people cross this far before the line, from this far beside the road [m]
 APART = 14.0  # nobody is placed nearer to someone else of the same lane than this [m]
