@@ -41,18 +41,19 @@ def _is_range(value: Any) -> bool:
 
 RULES = (
     Rule(
-        (
-            "duration route_length target_speed max_speed max_acceleration max_braking max_wheel_angle max_lateral_acceleration "
-            "lane_tolerance graded_cost_ttc merge_length departure walking_speed hall_width"
-        ).split(),
+        """
+            duration route_length target_speed max_speed max_acceleration max_braking max_wheel_angle
+            max_lateral_acceleration lane_tolerance graded_cost_ttc merge_length departure walking_speed
+            hall_width
+        """.split(),
         _is_positive,
         "a number above 0",
     ),
     Rule(
-        (
-            "velocity_sharpness orientation_sharpness exploration_decay traffic_behind traffic_ahead desired_speed_spread "
-            "slowdown_speed slowdown_duration"
-        ).split(),
+        """
+            velocity_sharpness orientation_sharpness exploration_decay traffic_behind traffic_ahead
+            desired_speed_spread slowdown_speed slowdown_duration
+        """.split(),
         lambda value: _is_finite(value) and value >= 0,
         "a number from 0 on",
     ),
@@ -62,10 +63,11 @@ RULES = (
         "a share from 0 to 1",
     ),
     Rule(
-        (
-            "start_speed headway desired_speed slow_speed fast_speed merge_start slowdown_start event_pause event_braking "
-            "halt_duration block_pause block_appears approach walking_pause box_side course_length obstacles"
-        ).split(),
+        """
+            start_speed headway desired_speed slow_speed fast_speed merge_start slowdown_start event_pause
+            event_braking halt_duration block_pause block_appears approach walking_pause box_side course_length
+            obstacles
+        """.split(),
         _is_range,
         "two numbers from 0 on, the smaller one first",
     ),
