@@ -5,6 +5,7 @@ from gymnasium.envs.registration import register
 _SCENARIOS = {
     "highway": "sb3_esad.envs.highway:Highway",
     "traffic-negotiation": "sb3_esad.envs.negotiation:TrafficNegotiation",
+    "town03": "sb3_esad.envs.town:Town03",
     "town06": "sb3_esad.envs.town:Town06",
     "town07": "sb3_esad.envs.town:Town07",
     "town10": "sb3_esad.envs.town:Town10",

@@ -11,6 +11,7 @@ from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lanes import LANE_WIDTH, NO_LANE, Lane
 from sb3_esad.envs.pieces import Piece, turning
 from sb3_esad.envs.roads import DASH_LENGTH, DASH_PERIOD, Markings, Road
+from sb3_esad.envs.roundabouts import Roundabout
 
 SIDE_TURN = math.pi / 6  # a way through a junction that turns by more than this leads to the side [rad]
 COMFORTABLE = 2.5  # nobody need take a bend with a greater acceleration to the side than this [m/s^2]
@@ -113,27 +114,26 @@ class Network:
             for start in np.arange(0.0, between.length, DASH_PERIOD).tolist():
                 self._dashes.append(facets(between.cut(start, min(start + DASH_LENGTH, between.length))))
 
-    def connect(self, source: int, target: int, speed_limit: float) -> Way:
+    def connect(self, source: int, target: int, speed_limit: float) -> None:
         """
         Lead from the end of a lane to the start of another.
 
         :param source: index of the lane that ends
         :param target: index of the lane that starts
         :param speed_limit: lower where it turns sharply [m/s]
-        :return: the way
         :raises ValueError: if no arc leads there
         """
         end, start = self._pieces[source], self._pieces[target]
         x, y = end.end.tolist()
-        pieces = turning((x, y), end.heading_at(end.length), start.start, start.heading)
+        self._lead(source, target, turning((x, y), end.heading_at(end.length), start.start, start.heading), speed_limit)
+
+    def _lead(self, source: int, target: int, pieces: Sequence[Piece], speed_limit: float) -> None:
         first = len(self._pieces)
         for number, piece in enumerate(pieces, 1):
             self._add(piece, speed_limit, following=first + number if number < len(pieces) else target)
         if self._links[source]["following"] == NO_LANE:
             self._links[source]["following"] = first
-        way = Way(source, target, tuple(range(first, len(self._pieces))), self._junctions)
-        self.ways.append(way)
-        return way
+        self.ways.append(Way(source, target, tuple(range(first, len(self._pieces))), self._junctions))
 
     def junction(self, arriving: Sequence[Carriageway], leaving: Sequence[Carriageway], speed_limit: float) -> None:
         """
@@ -160,6 +160,30 @@ class Network:
             return list(zip(coming.exits, going.entries, strict=False))
         side = -1 if turn > 0 else 0
         return [(coming.exits[side], going.entries[side])]
+
+    def roundabout(
+        self, ring: Roundabout, arriving: Sequence[Carriageway], leaving: Sequence[Carriageway], speed_limit: float
+    ) -> None:
+        """
+        Lead from every street to every other one by a ring, on which one turns to the left.
+
+        :param ring: its geometry
+        :param arriving: lanes that end at its rim, one carriageway for each street
+        :param leaving: lanes that start there, in the same order
+        :param speed_limit: [m/s]
+        """
+        self._junctions += 1
+        arms = [self._pieces[going.entries[0]].heading for going in leaving]
+        order = sorted(range(len(arms)), key=lambda arm: -(arms[arm] % (2 * math.pi)))
+        first = len(self._pieces)
+        for arm, following in zip(order, [*order[1:], order[0]], strict=True):
+            self._add(ring.ring(arms[arm] - ring.opening, arms[following] + ring.opening), speed_limit, following=NO_LANE)
+        for place, arm in enumerate(order):
+            before, after = first + (place - 1) % len(order), first + place
+            self._lead(arriving[arm].exits[-1], after, [ring.entry(arms[arm])], speed_limit)
+            self._lead(before, leaving[arm].entries[-1], [ring.exit(arms[arm])], speed_limit)
+            past = ring.ring(arms[arm] + ring.opening, arms[arm] - ring.opening)
+            self._lead(before, after, [past], speed_limit)
 
     def road(self) -> Road:
         """

@@ -145,6 +145,12 @@ class LitTown(TownDrive):
         return self.lights.red_lines(self.episode.time)
 
 
+class Town03(TownDrive):
+    """A wide junction, a roundabout and winding streets. See :class:`TownDrive`."""
+
+    town_name = "town03"
+
+
 class Town06(TownDrive):
     """Long streets of two lanes in either direction, in a grid. See :class:`TownDrive`."""
 

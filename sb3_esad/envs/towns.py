@@ -7,6 +7,9 @@ from sb3_esad.envs.networks import Carriageway, Network, Way
 from sb3_esad.envs.pieces import Piece, Point, rounded
 from sb3_esad.envs.right_of_way import Crossings
 from sb3_esad.envs.roads import Road
+from sb3_esad.envs.roundabouts import Roundabout
+
+Streets = tuple[tuple[Carriageway, Carriageway], ...]
 
 
 class Street(NamedTuple):
@@ -36,11 +39,31 @@ class TownMap(NamedTuple):
     :param places: where streets meet, by name [m]
     :param streets: all of them
     :param half_size: of each junction, from its centre to the lines before it [m]
+    :param roundabouts: radius of the ring at some places [m]
     """
 
     places: dict[str, Point]
     streets: tuple[Street, ...]
     half_size: float
+    roundabouts: dict[str, float] = {}  # noqa: RUF012 - nobody changes it
+
+    def roundabout(self, place: str) -> Roundabout:
+        """
+        The ring at a place.
+
+        :param place: a key of ``roundabouts``
+        :return: its geometry
+        """
+        return Roundabout(self.places[place], self.roundabouts[place])
+
+    def size(self, place: str) -> float:
+        """
+        How far from a place its streets end.
+
+        :param place: name
+        :return: [m]
+        """
+        return self.roundabout(place).half_size if place in self.roundabouts else self.half_size
 
 
 class Town(NamedTuple):
@@ -54,7 +77,7 @@ class Town(NamedTuple):
     """
 
     road: Road
-    streets: tuple[tuple[Carriageway, Carriageway], ...]
+    streets: Streets
     ways: tuple[Way, ...]
     crossings: Crossings
 
@@ -79,6 +102,34 @@ def grid(columns: int, rows: int, width: float, height: float, lanes: int, speed
     return TownMap(places, tuple(streets), half_size)
 
 
+TOWN03 = TownMap(
+    places={
+        "market": (0.0, 0.0),
+        "ring": (240.0, 0.0),
+        "north": (0.0, -170.0),
+        "mill": (240.0, -170.0),
+        "south": (0.0, 170.0),
+        "quay": (240.0, 170.0),
+        "west": (-130.0, 0.0),
+    },
+    streets=(
+        Street("market", "ring", speed_limit=13.0),
+        Street("north", "market", lanes=2, speed_limit=13.0),
+        Street("market", "south", lanes=2, speed_limit=13.0),
+        Street("mill", "ring"),
+        Street("ring", "quay"),
+        Street("north", "mill", ((60.0, -170.0), (110.0, -120.0), (160.0, -120.0), (200.0, -170.0)), radius=20.0),
+        Street("south", "quay", ((50.0, 170.0), (120.0, 220.0), (190.0, 170.0)), radius=30.0),
+        Street("market", "west", speed_limit=13.0),
+        Street("west", "north", ((-130.0, -170.0),), radius=40.0),
+        Street("west", "south", ((-130.0, 60.0), (-70.0, 110.0), (-70.0, 170.0)), radius=24.0),
+        Street("ring", "quay", ((370.0, 0.0), (370.0, 170.0)), radius=50.0),
+    ),
+    half_size=20.0,
+    roundabouts={"ring": 18.0},
+)
+"""A wide junction, a roundabout, and winding streets."""
+
 TOWN06 = grid(3, 3, 260.0, 200.0, lanes=2, speed_limit=15.0, half_size=20.0)
 """Long streets of two lanes in either direction."""
 
@@ -98,7 +149,7 @@ TOWN07 = TownMap(
 TOWN10 = grid(4, 4, 95.0, 85.0, lanes=1, speed_limit=11.0, half_size=14.0)
 """Many junctions close to each other."""
 
-MAPS = {"town10": TOWN10, "town06": TOWN06, "town07": TOWN07}
+MAPS = {"town03": TOWN03, "town06": TOWN06, "town07": TOWN07, "town10": TOWN10}
 
 
 @cache
@@ -115,21 +166,27 @@ def town(name: str) -> Town:
         for street in plan.streets
     )
     for place in plan.places:
-        ending = [there_and_back for street, there_and_back in zip(plan.streets, streets, strict=True) if street.end == place]
-        starting = [
-            there_and_back for street, there_and_back in zip(plan.streets, streets, strict=True) if street.start == place
-        ]
-        arriving = [there for there, _ in ending] + [back for _, back in starting]
-        leaving = [back for _, back in ending] + [there for there, _ in starting]
-        speed_limit = min(street.speed_limit for street in plan.streets if place in street[:2])
-        network.junction(arriving, leaving, speed_limit)
+        _join(plan, place, streets, network)
     road, ways = network.road(), tuple(network.ways)
     return Town(road, streets, ways, Crossings(road, ways))
+
+
+def _join(plan: TownMap, place: str, streets: Streets, network: Network) -> None:
+    """Lead from every street that ends at a place to every other one."""
+    pairs = list(zip(plan.streets, streets, strict=True))
+    ending, starting = ([both for street, both in pairs if street[end] == place] for end in (1, 0))
+    arriving = [there for there, _ in ending] + [back for _, back in starting]
+    leaving = [back for _, back in ending] + [there for there, _ in starting]
+    speed_limit = min(street.speed_limit for street in plan.streets if place in street[:2])
+    if place in plan.roundabouts:
+        network.roundabout(plan.roundabout(place), arriving, leaving, speed_limit)
+    else:
+        network.junction(arriving, leaving, speed_limit)
 
 
 def _between_junctions(plan: TownMap, street: Street) -> list[Piece]:
     pieces = rounded([plan.places[street.start], *street.via, plan.places[street.end]], street.radius)
     last = pieces[-1]
-    pieces[-1] = last.cut(0.0, last.length - plan.half_size)
-    pieces[0] = pieces[0].cut(plan.half_size, pieces[0].length)
+    pieces[-1] = last.cut(0.0, last.length - plan.size(street.end))
+    pieces[0] = pieces[0].cut(plan.size(street.start), pieces[0].length)
     return pieces
