@@ -21,7 +21,7 @@ from sb3_esad.driving_evaluation import DRIVERS
 
 ENV = "esad-highway-v0"
 TUNING = 700_000
-"""First seed of the episodes; no figure that is reported is measured on them."""
+"""First seed of the episodes; how well a model drives is measured on others."""
 BLIND_STEPS = 5
 
 

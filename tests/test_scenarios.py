@@ -22,10 +22,13 @@ from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.envs.negotiation import TrafficNegotiation, crossroads
 from sb3_esad.envs.obstacles import NOWHERE, ObstacleAvoidance
+from sb3_esad.envs.right_of_way import RightOfWay
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 from sb3_esad.envs.town import Town03, Town06, Town07, Town10
 from sb3_esad.envs.towns import MAPS, town
+from sb3_esad.envs.traffic import Traffic
+from sb3_esad.envs.users import Kind, User
 
 SCENARIOS: dict[str, type[Scenario]] = {
     "highway": Highway,
@@ -41,7 +44,8 @@ SCENARIOS: dict[str, type[Scenario]] = {
     "course-2mps": Course2,
     "course-3mps": Course3,
 }
-SOLVED = ("highway", "traffic-negotiation", "obstacle-avoidance", "braking")
+SOLVED = {"highway": 20.5, "traffic-negotiation": 5.0, "obstacle-avoidance": 8.0, "braking": 18.0}
+"""Least mean speed of the reference driver in the scenarios that are finished [m/s]."""
 IDS = [f"esad-{name}{suffix}-v0" for name in SCENARIOS for suffix in ("", "-vector", "-dict")]
 
 
@@ -108,10 +112,10 @@ def test_it_can_be_solved_and_is_not_trivial(name: str) -> None:
         summarise(evaluate_driver(driver, env_id, seeds)) for driver in ("reference", "keeper", "random")
     )
     assert reference["DS"] >= 95
-    assert reference["collision_free"] >= 0.96
+    assert reference["collision_free"] >= 0.97
     assert keeper["DS"] <= reference["DS"] - 25
     assert chance["DS"] < 25
-    assert reference["speed"] > keeper["speed"] / 2
+    assert reference["speed"] > SOLVED[name]
 
 
 def test_on_the_highway_following_is_enough_and_quick() -> None:
@@ -185,6 +189,20 @@ def test_ways_through_a_junction_cross_or_not() -> None:
             opposite = abs(wrap_angle(headings[0][first] - headings[0][second])) > 3
             if opposite and turns[first] == 0:
                 assert crosses[first, second] == (turns[second] == -1), "only who turns left crosses oncoming traffic"
+
+
+def test_people_beside_a_junction_hold_up_nobody() -> None:
+    road, arriving, ways, crossings = crossroads()
+    way = next(each for each in ways if each.source == arriving[0].exits[0])
+    start, heading = tuple(road.position(way.source, 235.0).tolist()), float(road.heading[way.source])
+    car = User(start, heading, 8.0, 10.0, path=(way.source, *way.lanes, way.target))
+    far = User(tuple(road.position(arriving[1].exits[0], 10.0).tolist()), drives=False)
+    people = [
+        User(tuple(road.position(lane.exits[0], 246.0, 4.5).tolist()), kind=Kind.PERSON, drives=False) for lane in arriving
+    ]
+    traffic = Traffic(road, [far, *people, car])
+    RightOfWay(crossings).regulate(traffic)
+    assert not np.isfinite(traffic.stop_distance).any()
 
 
 def test_everybody_gets_through_the_junction() -> None:

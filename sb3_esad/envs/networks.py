@@ -189,7 +189,7 @@ class Network:
         """
         Finish.
 
-        :return: the lanes and what the drawings show of them, junctions first, lest they cover lines
+        :return: the lanes and what the drawings show of them
         """
         lanes = [Lane(**asdict(piece), **links) for piece, links in zip(self._pieces, self._links, strict=True)]
         surfaces = [surface(piece) for piece in self._pieces]

@@ -6,9 +6,10 @@ import numpy as np
 
 from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.networks import Way
-from sb3_esad.envs.road_users import LOOKAHEAD
+from sb3_esad.envs.road_users import EGO, LOOKAHEAD
 from sb3_esad.envs.roads import Bools, Road
 from sb3_esad.envs.traffic import Traffic
+from sb3_esad.envs.users import Kind
 
 ZONE = 25.0  # from here on one queues up [m]
 APART = 3.0  # ways whose centre lines come nearer to each other than this cannot be driven at the same time [m]
@@ -34,7 +35,7 @@ class RightOfWay:
     """
     Lets road users wait at the line before a junction while others are on, or will be first on, a way that crosses theirs.
 
-    All users queue, the ego vehicle too, but what it does is its own affair.
+    All vehicles queue, the ego vehicle too, but what it does is its own affair.
 
     :param crossings: of the road
     """
@@ -50,7 +51,8 @@ class RightOfWay:
         :param traffic: all road users; ``stop_distance`` is set
         :param red: whether each way has a red light; who waits there is in nobody's way
         """
-        places = {row: place for row in range(len(traffic.speed)) if (place := self.way_ahead(traffic, row))}
+        vehicles = np.flatnonzero(traffic.kind == Kind.VEHICLE).tolist()
+        places = {row: place for row in vehicles if (place := self.way_ahead(traffic, row))}
         queue = {row: way for row, way in self._queue.items() if row in places and places[row][0] == way}
         newcomers = sorted((distance, row) for row, (_, distance) in places.items() if row not in queue)
         queue |= {row: places[row][0] for _, row in newcomers}
@@ -75,7 +77,7 @@ class RightOfWay:
         :param row: the user
         :return: number of the way, and the distance from the line before it, at most 0 on the way [m]; None if it is far
         """
-        lane = int(traffic.lane[row]) if row in traffic.outsiders else int(traffic.target_lane[row])
+        lane = int(traffic.lane[row] if row == EGO else traffic.target_lane[row])
         distance = -float(traffic.along[lane, row])
         for _ in range(LOOKAHEAD):
             if self._way_of[lane] != NO_LANE:

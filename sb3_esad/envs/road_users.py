@@ -38,7 +38,8 @@ class RoadUsers:
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
         self.wheel_angle = np.zeros(len(users))
-        self.next_lane, self._off_path = self._follow_paths(users)
+        self.next_lane, off_path = self._follow_paths(users)
+        self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T
         self._rows = np.arange(len(users))
         self._lookahead = LOOKAHEAD if (self.next_lane != NO_LANE).any() else 0
         self.target_lane = np.zeros(len(users), dtype=np.int64)
@@ -62,8 +63,8 @@ class RoadUsers:
         self.velocity = self.speed[:, None] * self.direction
         soon = self.position[self.outsiders] + INTENTION_HORIZON * self.velocity[self.outsiders]
         along, across = road.project(np.concatenate([self.position, soon]))
-        off_path = np.concatenate([self._off_path, self._off_path[self.outsiders]]).T
-        lane = road.closest_lane(along, across, np.concatenate([self.heading, self.heading[self.outsiders]]), off_path)
+        heading = np.concatenate([self.heading, self.heading[self.outsiders]])
+        lane = road.closest_lane(along, across, heading, self._handicap)
         self.along, self.across = along[:, :count], across[:, :count]
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
         within = np.abs(self.across) <= road.width[:, None] / 2 + self._margin
