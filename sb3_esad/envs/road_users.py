@@ -1,6 +1,6 @@
 """All road users as arrays: their bodies, how they move, and where they are on the lanes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class RoadUsers:
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
         self.kind = np.array([user.kind for user in users], dtype=np.int64)
         self._margin = np.where(self.kind == Kind.STATIC, self.size[:, 1] / 2, LANE_MARGIN)
+        self._any_on_foot = bool((self.kind == Kind.PERSON).any())
         self.drivers = np.flatnonzero([user.drives for user in users])
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
@@ -41,7 +42,6 @@ class RoadUsers:
         self.next_lane, off_path = self._follow_paths(users)
         self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T
         self._rows = np.arange(len(users))
-        self._lookahead = LOOKAHEAD if (self.next_lane != NO_LANE).any() else 0
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
         self.target_lane[:] = self.lane
@@ -70,10 +70,11 @@ class RoadUsers:
         within = np.abs(self.across) <= road.width[:, None] / 2 + self._margin
         self.present = within & (road.overshoot(self.along) <= CAR_LENGTH)
         # Others make room for a user that they do not steer in the lane where it will soon be, too.
-        # People beside the road are in nobody's way.
-        soon_off = across[lane[count:], np.arange(count, len(lane))]
-        heading_for = (self.kind[self.outsiders] != Kind.PERSON) | (np.abs(soon_off) <= LANE_WIDTH / 2)
-        self.present[self.target_lane[self.outsiders[heading_for]], self.outsiders[heading_for]] = True
+        rows = self.outsiders
+        if self._any_on_foot:  # people beside the road are in nobody's way
+            soon_off = np.abs(across[lane[count:], np.arange(count, len(lane))])
+            rows = rows[(self.kind[rows] != Kind.PERSON) | (soon_off <= LANE_WIDTH / 2)]
+        self.present[self.target_lane[rows], rows] = True
         self.reach, there = self.look_ahead(self._rows, self.lane)
         self.front, self.rear = self._nearest(self._rows, self.reach, there)
 
@@ -87,12 +88,29 @@ class RoadUsers:
             whether it is on one of them; each ``(n, users)``
         """
         place, there = self.along[lanes], self.present[lanes]
-        passed = np.zeros(len(rows))
-        for _ in range(self._lookahead):
-            passed, lanes = passed + self.road.length[lanes], np.where(lanes == NO_LANE, NO_LANE, self.next_lane[rows, lanes])
-            beyond = self.present[lanes] & ~there & (lanes != NO_LANE)[:, None]
-            place, there = np.where(beyond, passed[:, None] + self.along[lanes], place), there | beyond
+        for going, following, passed in self.lanes_ahead(rows, lanes):
+            beyond = self.present[following] & ~there[going]
+            place[going] = np.where(beyond, passed[:, None] + self.along[following], place[going])
+            there[going] |= beyond
         return place, there
+
+    def lanes_ahead(self, rows: Ints, lanes: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
+        """
+        Go on from lane to lane, as users take them.
+
+        :param rows: users, shape ``(n,)``
+        :param lanes: the lane from which each goes on, shape ``(n,)``
+        :return: for the first lanes ahead, then for the second and so on: the places in ``rows`` of those who have one, that
+            lane of each, and how far its start is from the start of the lane from which they came [m]
+        """
+        going, passed = np.arange(len(rows)), np.zeros(len(rows))
+        for _ in range(LOOKAHEAD):
+            passed, lanes = passed + self.road.length[lanes], self.next_lane[rows[going], lanes]
+            on = lanes != NO_LANE
+            if not on.any():
+                return
+            going, lanes, passed = going[on], lanes[on], passed[on]
+            yield going, lanes, passed
 
     def neighbours(self, rows: Ints, lanes: Ints) -> tuple[Ints, Ints]:
         """

@@ -58,13 +58,11 @@ class Traffic(RoadUsers):
 
     def _foresee_limits(self) -> Floats:
         """The speed from which each user can still slow down in time for the lanes ahead, shape ``(n,)``."""
-        road, lanes = self.road, self.lane
-        limit, distance = road.speed_limit[lanes], -self.along[lanes, self._rows]
-        for _ in range(self._lookahead):
-            distance = distance + road.length[lanes]
-            lanes = np.where(lanes == NO_LANE, NO_LANE, self.next_lane[self._rows, lanes])
-            in_time = np.sqrt(road.speed_limit[lanes] ** 2 + 2 * EASY_BRAKING * np.maximum(distance, 0.0))
-            limit = np.where(lanes == NO_LANE, limit, np.minimum(limit, in_time))
+        limits, own = self.road.speed_limit, self.along[self.lane, self._rows]
+        limit = limits[self.lane]
+        for going, lanes, passed in self.lanes_ahead(self._rows, self.lane):
+            distance = np.maximum(passed - own[going], 0.0)
+            limit[going] = np.minimum(limit[going], np.sqrt(limits[lanes] ** 2 + 2 * EASY_BRAKING * distance))
         return limit
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
@@ -163,7 +161,9 @@ class Traffic(RoadUsers):
             cars = rows[changing]
             front, _ = self.neighbours(cars, target[changing])
             acceleration[changing] = np.minimum(acceleration[changing], self.following_acceleration(cars, front, cars))
-        acceleration = np.minimum(acceleration, self.stopping_acceleration(rows))
+        waiting = np.flatnonzero(self.stop_distance[rows] < np.inf)
+        if waiting.size:
+            acceleration[waiting] = np.minimum(acceleration[waiting], self.stopping_acceleration(rows[waiting]))
         forced = self.forced_braking[rows]
         self.acceleration[rows] = np.where(forced > 0.0, -forced, bounded(acceleration, MAX_ACCELERATION))
 
