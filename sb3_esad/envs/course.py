@@ -18,7 +18,7 @@ BEHIND = 3.0  # the hall goes on this far before the start and past the goal [m]
 FREE_START, FREE_END = 5.0, 3.0  # nothing stands this near to the start and to the goal [m]
 PASSAGE = 2.0  # between any two obstacles there is as much room [m]
 WALL_GAP, PERSON_GAP = 0.7, 1.2  # of obstacles from the walls, and of people's ways from obstacles [m]
-CONE, PERSON = (0.4, 0.4), (0.5, 0.5)  # [m]
+CONE = (0.4, 0.4)  # [m]
 ATTEMPTS = 30
 
 
@@ -88,10 +88,8 @@ class Course(Scenario):
         ego = User(place, speed=speed, target_speed=config["target_speed"], drives=False, size=size)
         obstacles = self._place_obstacles(int(random.integers(config["obstacles"][0], config["obstacles"][1] + 1)))
         ends = self._draw_walks(obstacles)
-        people = [User(tuple(start), kind=Kind.PERSON, drives=False, size=PERSON) for start, _ in ends.tolist()]
-        rows = 1 + len(obstacles) + np.arange(len(people))
-        self.walkers = Walkers(random, rows, ends, config["walking_speed"], config["walking_pause"])
-        return Traffic(self.road, [ego, *obstacles, *people])
+        self.walkers = Walkers(random, ends, config["walking_speed"], config["walking_pause"])
+        return Traffic(self.road, [ego, *obstacles, *self.walkers.people()])
 
     def _place_obstacles(self, count: int) -> list[User]:
         """Boxes and cones at random places with room to pass between any two of them; fewer if the hall is full."""

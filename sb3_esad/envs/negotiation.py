@@ -58,7 +58,8 @@ class TrafficNegotiation(NetworkDrive):
     @classmethod
     def default_config(cls) -> dict[str, Any]:
         """See :meth:`Scenario.default_config`."""
-        return {**super().default_config(), "approach": (50.0, 70.0), "departure": 50.0, "cars_per_street": 4}
+        cars = {"cars_per_street": 4, "headway": (1.5, 4.5)}
+        return {**super().default_config(), "approach": (50.0, 70.0), "departure": 50.0, **cars}
 
     def _make_road(self) -> Road:
         self.crossroads = crossroads()

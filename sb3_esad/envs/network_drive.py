@@ -33,8 +33,6 @@ class NetworkDrive(Scenario):
             "max_speed": 15.0,
             "start_speed": (8.0, 11.0),
             "desired_speed": (8.0, 11.5),
-            "desired_speed_spread": 0.5,
-            "headway": (1.5, 4.5),
         }
 
     @abstractmethod
@@ -53,8 +51,7 @@ class NetworkDrive(Scenario):
     def _make_traffic(self) -> Traffic:
         config, lane = self.config, self.route.lanes[0]
         speed = float(self.np_random.uniform(*config["start_speed"]))
-        none, spread = (0.0, 0.0), config["desired_speed_spread"]
-        population = Population(self.np_random, self.road, 0.0, none, 0.0, none, spread, config["headway"])
+        population = Population(self.np_random, self.road)
         x, y = self.road.position(lane, self._start).tolist()
         heading = self.road.lanes[lane].heading_at(self._start)
         ego = User(

@@ -25,71 +25,67 @@ class Stretch(NamedTuple):
     clear: tuple[float, float] = (0.0, 0.0)
 
 
-class Population:
+class Mix(NamedTuple):
     """
-    Draws cars; a few of them are much slower or faster than the rest.
+    What speeds the cars of a stretch would like to have, and how densely they drive; a few are much slower or faster.
 
-    :param random: where the draws come from
-    :param road: where the cars drive
+    :param mean: of the desired speeds of the rest [m/s]
+    :param spread: of these, to either side [m/s]
     :param slow_share: share of slow cars
     :param slow_speed: smallest and largest desired speed of these [m/s]
     :param fast_share: share of fast cars
     :param fast_speed: smallest and largest desired speed of these [m/s]
-    :param spread: of the desired speeds of the rest, to either side of the mean [m/s]
     :param headway: smallest and largest time gap between cars that are placed one behind the other [s]
     """
 
-    def __init__(
-        self,
-        random: np.random.Generator,
-        road: Road,
-        slow_share: float,
-        slow_speed: tuple[float, float],
-        fast_share: float,
-        fast_speed: tuple[float, float],
-        spread: float,
-        headway: tuple[float, float],
-    ) -> None:
+    mean: float
+    spread: float
+    slow_share: float
+    slow_speed: tuple[float, float]
+    fast_share: float
+    fast_speed: tuple[float, float]
+    headway: tuple[float, float]
+
+
+class Population:
+    """
+    Draws cars.
+
+    :param random: where the draws come from
+    :param road: where the cars drive
+    """
+
+    def __init__(self, random: np.random.Generator, road: Road) -> None:
         self.random = random
         self.road = road
-        self.slow_share, self.slow_speed = slow_share, slow_speed
-        self.fast_share, self.fast_speed = fast_share, fast_speed
-        self.spread = spread
-        self.headway = headway
 
-    def fill(self, stretch: Stretch, mean_speed: float, first_speed: float) -> list[User]:
+    def fill(self, stretch: Stretch, mix: Mix, first_speed: float) -> list[User]:
         """
         Fill a stretch with cars, front to back, none much faster than the one ahead of it.
 
         :param stretch: where
-        :param mean_speed: mean of their desired speeds [m/s]
+        :param mix: of their desired speeds
         :param first_speed: the first car is at most 1 m/s faster than this [m/s]
         :return: the cars
         """
         cars: list[User] = []
         along, ahead = stretch.end - self.random.uniform(0.0, 40.0), first_speed
         while along > stretch.start:
-            desired = self.desired_speed(mean_speed)
+            desired = self._desired_speed(mix)
             if not stretch.clear[0] < along < stretch.clear[1]:
                 speed = min(desired, ahead + 1.0)
                 cars.append(self.car(stretch.lane, along, speed, desired, self.temper()))
                 ahead = speed
-            along -= CAR_LENGTH + desired * self.random.uniform(*self.headway)
+            along -= CAR_LENGTH + desired * self.random.uniform(*mix.headway)
         return cars
 
-    def desired_speed(self, mean: float) -> float:
-        """
-        Draw the speed that a car would like to have.
-
-        :param mean: of the cars that are neither slow nor fast [m/s]
-        :return: [m/s]
-        """
+    def _desired_speed(self, mix: Mix) -> float:
         draw = self.random.random()
-        if draw < self.slow_share:
-            return float(self.random.uniform(*self.slow_speed))
-        if draw > 1.0 - self.fast_share:
-            return float(self.random.uniform(*self.fast_speed))
-        return float(mean + self.random.uniform(-1.0, 1.0) * self.spread)
+        if draw < mix.slow_share:
+            return float(self.random.uniform(*mix.slow_speed))
+        if draw > 1.0 - mix.fast_share:
+            return float(self.random.uniform(*mix.fast_speed))
+        return float(mix.mean + self.random.uniform(-1.0, 1.0) * mix.spread)
 
     def temper(self) -> Temper:
         """
@@ -119,6 +115,6 @@ class Population:
         :return: the car
         """
         x, y = self.road.position(lane, along).tolist()
-        heading = float(self.road.heading_at(np.array([lane]), np.array([along]))[0])
+        heading = self.road.lanes[lane].heading_at(along)
         timer = float(self.random.uniform(0.0, temper.delay))
         return User((x, y), heading, speed, desired, temper=temper, timer=timer, path=path)

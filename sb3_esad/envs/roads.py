@@ -132,15 +132,21 @@ class Road:
         :param lanes: indices of lanes
         :return: these and all lanes of the same direction beside them
         """
-        found: set[int] = set()
-        for lane in lanes:
-            found.add(lane)
-            for beside in (self.left, self.right):
-                each = int(beside[lane])
-                while each != NO_LANE:
-                    found.add(each)
-                    each = int(beside[each])
-        return found
+        return {each for lane in lanes for beside in (self.left, self.right) for each in self.row(lane, beside)}
+
+    @staticmethod
+    def row(lane: int, beside: Ints) -> list[int]:
+        """
+        Go from lane to lane to one side.
+
+        :param lane: index of the first
+        :param beside: ``left`` or ``right``
+        :return: the first lane and all that follow, to the outermost
+        """
+        row = [lane]
+        while beside[row[-1]] != NO_LANE:
+            row.append(int(beside[row[-1]]))
+        return row
 
     def closest_lane(self, along: Floats, across: Floats, heading: Floats, handicap: Floats) -> Ints:
         """
@@ -174,17 +180,11 @@ class Road:
         :param across: of the point on every lane, shape ``(lanes,)`` [m]
         :return: to the left and to the right, negative past the edge [m]
         """
-        leftmost, rightmost = self._outermost(lane, self.left), self._outermost(lane, self.right)
+        leftmost, rightmost = self.row(lane, self.left)[-1], self.row(lane, self.right)[-1]
         return (
             float(self.width[leftmost] / 2 + across[leftmost]),
             float(self.width[rightmost] / 2 - across[rightmost]),
         )
-
-    @staticmethod
-    def _outermost(lane: int, beside: Ints) -> int:
-        while beside[lane] != NO_LANE:
-            lane = int(beside[lane])
-        return lane
 
     def end(self, lane: int) -> Floats:
         """

@@ -4,8 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_esad.envs.lanes import NO_LANE
-from sb3_esad.envs.roads import Ints, Road
+from sb3_esad.envs.roads import Road
 
 
 class Route:
@@ -30,15 +29,10 @@ class Route:
             for each in road.with_lanes_beside([lane]):
                 self.contains[each] = True
                 self._before[each], self._stretch[each] = metres, road.length[lane] / road.length[each]
-            self._lead_back(lane, road.left)
-            self._lead_back(lane, road.right)
+            for row in (road.row(lane, road.left), road.row(lane, road.right)):
+                self.back[row[1:]] = row[:-1]
             metres += float(road.length[lane])
         self.length = metres - float(road.length[lanes[-1]]) + end
-
-    def _lead_back(self, lane: int, beside: Ints) -> None:
-        while beside[lane] != NO_LANE:
-            self.back[beside[lane]] = lane
-            lane = int(beside[lane])
 
     def progress(self, lane: int, along: float) -> float:
         """

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 
 from sb3_esad.envs.lanes import LANE_WIDTH, NO_LANE, Lane
-from sb3_esad.envs.population import Population, Stretch
+from sb3_esad.envs.population import Mix, Population, Stretch
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Markings, Road, dashes
 from sb3_esad.envs.routes import Route
@@ -85,7 +85,7 @@ class StraightDrive(Scenario):
         return Route(self.road, [0], -ROAD_START, self.config["route_length"] - ROAD_START)
 
     def _make_traffic(self) -> Traffic:
-        self.population = self._make_population()
+        self.population = Population(self.np_random, self.road)
         own_lane = int(self.np_random.integers(self.lanes))
         speed = float(self.np_random.uniform(*self.config["start_speed"]))
         place, target = (0.0, own_lane * LANE_WIDTH), self.config["target_speed"]
@@ -94,12 +94,6 @@ class StraightDrive(Scenario):
         cars = [car for lane in range(self.lanes) for car in self._lane_traffic(lane, lane == own_lane)]
         return Traffic(self.road, [ego, *cars, *self._others()])
 
-    def _make_population(self) -> Population:
-        config = self.config
-        names = ("slow_share", "slow_speed", "fast_share", "fast_speed", "headway")
-        spread = config["desired_speed_spread"]
-        return Population(self.np_random, self.road, spread=spread, **{name: config[name] for name in names})
-
     def _lane_traffic(self, lane: int, own: bool) -> list[User]:
         """Cars of one lane, the right lanes being slower; a gap is kept free around the ego vehicle in its own lane."""
         config, start = self.config, -ROAD_START
@@ -107,7 +101,9 @@ class StraightDrive(Scenario):
         mean = fast - (fast - slow) * lane / max(self.lanes - 1, 1)
         clear = (start - 40.0, start + 45.0) if own else (0.0, 0.0)
         stretch = Stretch(lane, start - config["traffic_behind"], start + config["traffic_ahead"], clear)
-        return self.population.fill(stretch, mean, config["max_speed"])
+        names = ("slow_share", "slow_speed", "fast_share", "fast_speed", "headway")
+        mix = Mix(mean, config["desired_speed_spread"], *(config[name] for name in names))
+        return self.population.fill(stretch, mix, config["max_speed"])
 
     def _others(self) -> list[User]:
         """Further road users of this scenario."""

@@ -13,10 +13,9 @@ from sb3_esad.envs.right_of_way import RightOfWay
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.towns import Town, town
-from sb3_esad.envs.users import Kind, User
+from sb3_esad.envs.users import User
 from sb3_esad.envs.walkers import Walkers
 
-PERSON_SIZE = (0.6, 0.6)  # [m]
 CROSSING, KERB = 4.0, 2.0  # people cross this far before the line, from this far beside the road [m]
 APART = 14.0  # nobody is placed nearer to someone else of the same lane than this [m]
 
@@ -113,10 +112,8 @@ class LitTown(TownDrive):
     def _place_others(self, population: Population) -> list[User]:
         cars, config = super()._place_others(population), self.config
         ends = np.array([self._draw_crossing() for _ in range(config["people"])]).reshape(-1, 2, 2)
-        people = [User(tuple(start), kind=Kind.PERSON, drives=False, size=PERSON_SIZE) for start, _ in ends.tolist()]
-        rows = 1 + len(cars) + np.arange(len(people))
-        self.walkers = Walkers(self.np_random, rows, ends, config["walking_speed"], config["walking_pause"])
-        return [*cars, *people]
+        self.walkers = Walkers(self.np_random, ends, config["walking_speed"], config["walking_pause"])
+        return [*cars, *self.walkers.people()]
 
     def _draw_crossing(self) -> list[Floats]:
         """Two places on either side of a street, just before a junction, in any order."""
