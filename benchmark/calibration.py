@@ -8,7 +8,7 @@ the discounted cost to come are set against what came: over all states, and draw
 import argparse
 from functools import partial
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
@@ -42,7 +42,8 @@ def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int) -> Visits:
     """
     env, policy, agent = DummyVecEnv([partial(gym.make, env_id)] * n_envs), model.policy, model.policy.average
     env.seed(UNSEEN)
-    observation, starts, latent = env.reset(), np.ones(n_envs, dtype=bool), policy.initial_state(n_envs)
+    observation: Any = env.reset()
+    starts, latent = np.ones(n_envs, dtype=bool), policy.initial_state(n_envs)
     rows = []
     for _ in range(n_steps // n_envs):
         latent = agent.filter(policy.obs_to_tensor(observation)[0], latent, th.as_tensor(starts), False)

@@ -9,6 +9,7 @@ import argparse
 import json
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -72,9 +73,9 @@ def sac(seed: int, changes: dict[str, Any]) -> SAC:
     :param changes: arguments of the constructor to replace, and ``penalty``, what a cost takes from the reward
     :return: the algorithm
     """
-    penalty = {"penalty": changes.pop("penalty", 0.0)}
+    penalty = changes.pop("penalty", 0.0)
     arguments: dict[str, Any] = {"buffer_size": 50_000, "batch_size": 128, "gamma": 0.97, "learning_starts": 1000, **changes}
-    return SAC("CnnPolicy", make_vec_env(ENV, wrapper_class=CostInReward, wrapper_kwargs=penalty), seed=seed, **arguments)
+    return SAC("CnnPolicy", make_vec_env(ENV, wrapper_class=partial(CostInReward, penalty=penalty)), seed=seed, **arguments)
 
 
 ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {"esad_lend": esad_lend, "sac": sac}
@@ -112,7 +113,7 @@ class LearningCurve(BaseCallback):
     def _evaluate(self) -> None:
         self._seconds += time.monotonic() - self._resumed
         self._evaluated = self.num_timesteps
-        line = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
+        line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
         line |= {"training_cost": self._cost, "training_episodes": self._episodes}
         for name, deterministic in (("best", True), ("sampled", False)):
             line[name] = summarise(evaluate_model(self.model, ENV, self.seeds, deterministic))

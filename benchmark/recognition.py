@@ -6,18 +6,19 @@ by its imagination of the last steps, given the actions that were taken. A table
 """
 
 import argparse
+import math
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
-import numpy as np
 import pandas as pd
 import torch as th
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.type_aliases import LatentState
-from sb3_esad.driving_evaluation import DRIVERS
+from sb3_esad.envs.drivers import DRIVERS
+from sb3_esad.envs.scenario import scenario_of
 
 ENV = "esad-highway-v0"
 TUNING = 700_000
@@ -58,7 +59,7 @@ def endings(model: ESADLEND, driver_name: str, seeds: range) -> Iterator[Ending]
         states, info = drive(model, env, driver_name, seed)
         start, *last = states[-1 - BLIND_STEPS :]
         terms = [name for name, happened in info["cost_terms"].items() if happened]
-        foreseen = 1 - np.prod([1 - expected_cost(model, state) for state in imagine(model, start, last)])
+        foreseen = 1 - math.prod(1 - expected_cost(model, state) for state in imagine(model, start, last))
         critic = model.policy.cost_critic_target(model.policy.world_model_target.features(start), start.action)[0].max()
         yield Ending(driver_name, ", ".join(terms) or "none", expected_cost(model, states[-1]), foreseen, critic.item())
 
@@ -76,7 +77,7 @@ def drive(model: ESADLEND, env: gym.Env[Any, Any], driver_name: str, seed: int) 
     agent, done = model.policy.average, False
     observation, info = env.reset(seed=seed)
     state, start = model.policy.initial_state(1), th.ones(1, dtype=th.bool)
-    driver = None if driver_name == "itself" else DRIVERS[driver_name](seed)
+    driver = None if driver_name == "itself" else DRIVERS[driver_name](scenario_of(env), seed)
     states: list[LatentState] = []
     while True:
         state = agent.filter(model.policy.obs_to_tensor(observation)[0], state, start, True)

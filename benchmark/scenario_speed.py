@@ -8,6 +8,7 @@ import highway_env  # noqa: F401  (registers the stock environments)
 import numpy as np
 
 import sb3_esad.envs  # noqa: F401  (registers ours)
+from sb3_esad.envs.scenario import scenario_of
 
 
 def stock(vehicles: int) -> gym.Env:
@@ -55,7 +56,7 @@ def main() -> None:
     args = parser.parse_args()
     ours = gym.make("esad-highway-v0")
     ours.reset(seed=0)
-    vehicles = len(ours.unwrapped.traffic.speed) - 1
+    vehicles = len(scenario_of(ours).traffic.speed) - 1
     envs = {"esad-highway-v0": ours, "highway-fast-v0": stock(vehicles)}
     rates: dict[str, list[float]] = {name: [] for name in envs}
     for _ in range(args.repeats):

@@ -89,8 +89,8 @@ def record(config: dict[str, Any], n_steps: int, seed: int, length: int) -> Sequ
     spaces = gym.make(ENV, config=config)
     buffer = SequenceReplayBuffer(n_steps, spaces.observation_space, spaces.action_space, "auto", sequence_length=length)
     for _, step in zip(range(n_steps), steps(config, seed), strict=False):
-        fields = (np.array([field]) for field in step[:-1])
-        buffer.add(*fields, [step.info])
+        observation, following, action, reward, done = (np.array([field]) for field in step[:-1])
+        buffer.add(observation, following, action, reward, done, [step.info])
     return buffer
 
 
@@ -135,6 +135,7 @@ class Gauge:
         :param samples: windows of recorded steps
         :param start: step after which the model is blind
         """
+        assert isinstance(samples.next_observations, th.Tensor)
         images = samples.next_observations.transpose(0, 1).float() / 255
         filtered = model.observe(samples, th.zeros_like(samples.is_first.T))
         state = filtered.states.map(lambda field: field[start])

@@ -11,7 +11,8 @@ from stable_baselines3.common.utils import set_random_seed
 
 from sb3_esad import ESADLEND, __version__
 from sb3_esad.demo import ENV_ID, MINUTES, TIMESTEPS, run_demo
-from sb3_esad.driving_evaluation import DRIVERS, evaluate_driver, evaluate_model
+from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
+from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.report import format_table, summarise_any, write_json
 from sb3_esad.video import record_driver, record_model
 

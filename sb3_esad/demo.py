@@ -18,7 +18,7 @@ from sb3_esad.hyperparams import load_hyperparams
 from sb3_esad.plots import plot_learning_curve
 from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar
 from sb3_esad.report import Figures, format_table, summarise_any
-from sb3_esad.video import record_model
+from sb3_esad.video import record_model, video_writer
 
 ENV_ID = "esad-highway-v0"
 TIMESTEPS, MINUTES = 20_000, 8.0
@@ -41,7 +41,9 @@ def run_demo(folder: Path, seed: int = 0, timesteps: int = TIMESTEPS, minutes: f
     :param minutes: of training at most; the learning rate falls to zero over what comes first
     :param episodes: of the evaluation
     :raises ValueError: if the training was too short for a single episode
+    :raises ImportError: if the library that writes videos is missing
     """
+    video_writer()
     folder.mkdir(parents=True, exist_ok=True)
     model, training = train(folder, seed, timesteps, minutes)
     seeds = range(UNSEEN, UNSEEN + episodes)

@@ -1,30 +1,19 @@
 """Evaluation on chosen seeds: every episode is driven once and to its end, whoever drives."""
 
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from numpy.typing import NDArray
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_esad.common.costs import CostReader
-from sb3_esad.envs.drivers import CarFollower, RandomDriver, ReferenceDriver, SpeedKeeper
+from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.envs.metrics import Record
 from sb3_esad.envs.scenario import Scenario
-
-Driver = Callable[[gym.Env[Any, Any]], NDArray[np.float32]]
-
-DRIVERS: dict[str, Callable[[int], Driver]] = {
-    "reference": lambda seed: ReferenceDriver(),
-    "follower": lambda seed: CarFollower(),
-    "keeper": lambda seed: SpeedKeeper(),
-    "random": RandomDriver,
-}
-"""Makes a scripted driver for the episode of a seed."""
 
 
 class SeededEpisodes(gym.Wrapper[Any, Any, Any, Any]):
@@ -131,10 +120,10 @@ def evaluate_driver(name: str, env_id: str, seeds: Sequence[int]) -> list[Record
     :raises ValueError: if the environment is no driving scenario
     """
     env = _make(env_id, seeds)
-    check_scenario(env, env_id)
+    scenario = check_scenario(env, env_id)
     while not env.finished:
         env.reset()
-        driver, done = DRIVERS[name](env.seed), False
+        driver, done = DRIVERS[name](scenario, env.seed), False
         while not done:
             _, _, terminated, truncated, _ = env.step(driver(env))
             done = terminated or truncated
@@ -142,16 +131,18 @@ def evaluate_driver(name: str, env_id: str, seeds: Sequence[int]) -> list[Record
     return env.records
 
 
-def check_scenario(env: gym.Env[Any, Any], env_id: str) -> None:
+def check_scenario(env: gym.Env[Any, Any], env_id: str) -> Scenario:
     """
     Refuse an environment that scripted drivers do not know their way about in.
 
     :param env: environment, wrapped or not
     :param env_id: its name
+    :return: the scenario inside its wrappers
     :raises ValueError: if it is no driving scenario
     """
     if not isinstance(env.unwrapped, Scenario):
         raise ValueError(f"{env_id} is no driving scenario; scripted drivers and videos need an id that starts with esad-.")
+    return env.unwrapped
 
 
 def check_spaces(model: BaseAlgorithm, env: VecEnv | gym.Env[Any, Any], env_id: str) -> None:

@@ -13,7 +13,9 @@ import numpy as np
 from sb3_esad.common.costs import CostReader
 from sb3_esad.common.save_util import whole_file
 from sb3_esad.dream import DreamingDriver
-from sb3_esad.driving_evaluation import DRIVERS, check_scenario, check_spaces
+from sb3_esad.driving_evaluation import check_scenario, check_spaces
+from sb3_esad.envs.drivers import DRIVERS
+from sb3_esad.envs.scenario import scenario_of
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.panels import BAD, GOOD, Gauge, Picture, compose, paint
 
@@ -66,20 +68,30 @@ def write_video(path: Path, frames: Iterable[Picture], fps: int) -> None:
     """
     if path.suffix not in ("", ".mp4"):
         raise ValueError(f"{path} is no MP4; give the video a name that ends with .mp4.")
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ImportError("Videos need imageio-ffmpeg: pip install 'sb3_esad[demo]'.") from error
     pictures = iter(frames)
     first = next(pictures)
     options = {"fps": fps, "quality": 8, "output_params": ["-movflags", "+faststart"]}
     with (
         whole_file(path, ".mp4") as target,
-        closing(imageio_ffmpeg.write_frames(target, first.shape[1::-1], **options)) as writer,
+        closing(video_writer().write_frames(target, first.shape[1::-1], **options)) as writer,
     ):
         writer.send(None)
         for picture in chain([first], pictures):
             writer.send(np.ascontiguousarray(picture))
+
+
+def video_writer() -> Any:
+    """
+    Find the library that writes videos; to ask for it early spares a long training whose video fails.
+
+    :return: the module
+    :raises ImportError: if it is missing
+    """
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError("Videos need imageio-ffmpeg: pip install 'sb3_esad[demo]'.") from error
+    return imageio_ffmpeg
 
 
 def _make(env_id: str) -> gym.Env[Any, Any]:
@@ -89,7 +101,7 @@ def _make(env_id: str) -> gym.Env[Any, Any]:
 
 
 def _drive(env: gym.Env[Any, Any], name: str, seed: int) -> Iterator[Picture]:
-    driver, done = DRIVERS[name](seed), False
+    driver, done = DRIVERS[name](scenario_of(env), seed), False
     env.reset(seed=seed)
     while not done:
         yield _render(env)

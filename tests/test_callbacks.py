@@ -32,9 +32,9 @@ class RecordingPenalty(AugmentedLagrangian):
         self.updates: list[tuple[Any, int]] = []
         self.n_observed = 0
 
-    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+    def observe(self, costs: np.ndarray, dones: np.ndarray, truncated: np.ndarray | None = None) -> None:
         self.n_observed += len(costs)
-        super().observe(costs, dones)
+        super().observe(costs, dones, truncated)
 
     def update(self, violation: Any, gradient_steps: int = 1) -> dict[str, float]:
         self.updates.append((violation, gradient_steps))
@@ -99,7 +99,14 @@ def test_multiplier_moves_whatever_callback_the_user_has() -> None:
         return True
 
     mine = CountCalls()
-    choices: list[MaybeCallback] = [None, mine, [CountCalls(), CountCalls()], function]
+    choices: list[MaybeCallback] = [
+        None,
+        mine,
+        [CountCalls(), CountCalls()],
+        function,
+        LagrangeCallback(),
+        [LagrangeCallback()],
+    ]
     for callback in choices:
         model = make_model()
         model.learn(40, callback=callback)
@@ -107,6 +114,15 @@ def test_multiplier_moves_whatever_callback_the_user_has() -> None:
         assert len(model.penalty.updates) == 8
         assert model.penalty.multiplier.item() > 1.0
     assert mine.n_inits == 1 and mine.n_calls == 40 and len(called) == 40
+
+
+@pytest.mark.parametrize(("end", "time_limit", "length"), [(6, 1000, 5.0), (1000, 6, 6.0)])
+def test_a_time_limit_is_no_crash(end: int, time_limit: int, length: float) -> None:
+    """The sixth step costs 1: as the end of the episode it cuts it short, as its time limit it does not."""
+    model = make_model(CountingEnv(episode_length=end, time_limit=time_limit), learning_starts=0)
+    model.penalty.episodes.mean_length.fill_(5.0)
+    model.learn(60)
+    assert model.penalty.episodes.episode_length == length
 
 
 def test_no_violation_counts_twice() -> None:

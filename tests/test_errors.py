@@ -263,3 +263,9 @@ def test_a_rate_that_never_falls_is_a_number() -> None:
     with pytest.raises(ValueError) as error:
         HoldThenFall(0.006, hold=1.0)
     check_sentence(error, "hold is 1.0", "[0, 1)")
+
+
+@pytest.mark.parametrize("name", ["memory_channels", "latent_channels"])
+def test_no_channels(name: str) -> None:
+    with pytest.raises(ValueError, match=f"{name} is 0; choose a number >= 1, or None for the usual one"):
+        ESADLEND("MlpPolicy", CountingEnv(), policy_kwargs={name: 0})

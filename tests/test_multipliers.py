@@ -138,7 +138,79 @@ def test_at_the_allowed_rate_the_signal_of_the_road_has_no_direction() -> None:
             penalty.observe(crashes * last, last)
         signals.append(penalty.update(0.0)["violation_road"])
     assert np.mean(signals[20:]) == pytest.approx(0.0, abs=0.1)
-    assert min(signals) == pytest.approx(-1 / 3, abs=0.05) and max(signals[20:]) == 1.0
+    single_crash = 150 / 3000 / 0.5  # in the two episodes of each environment that are remembered
+    assert min(signals) == pytest.approx(-0.05 / single_crash, abs=0.05) and max(signals[20:]) == 1.0
+
+
+def observe_in_step(penalty: AugmentedLagrangian, costs: list[float], n_envs: int, n_episodes: int) -> None:
+    """All environments live through the same episode at the same time, whose end is its time limit."""
+    for _ in range(n_episodes):
+        for step, cost in enumerate(costs, start=1):
+            last = np.full(n_envs, step == len(costs))
+            penalty.observe(np.full(n_envs, cost), last, truncated=last)
+            penalty.update(0.0)
+
+
+@pytest.mark.parametrize("n_envs", [1, 4, 16])
+@pytest.mark.parametrize(("cost", "rises"), [(1.0, True), (0.25, False)])
+def test_the_signal_of_the_road_is_the_same_for_any_number_of_environments(n_envs: int, cost: float, rises: bool) -> None:
+    """A cost near the end of long episodes, twice or half of the limit, would be missing in most shorter windows."""
+    penalty = make_penalty(cost_limit=0.5, lagrangian_multiplier_init=10.0, episode_length=100, road_steps=200)
+    observe_in_step(penalty, [0.0] * 95 + [cost] + [0.0] * 4, n_envs, n_episodes=12)
+    assert (penalty.multiplier.item() > 12.0) == rises
+    assert (penalty.multiplier.item() < 8.5) == (not rises)
+
+
+def test_every_episode_has_a_cost_and_the_limit_allows_it() -> None:
+    """Lengths count although no episode is cost-free: at 20 steps and a cost of .5 the limit of 1 is kept."""
+    penalty = make_penalty(cost_limit=1.0, cost_gamma=0.97, episode_length=1000, road_steps=200)
+    observe_in_step(penalty, [0.0] * 10 + [0.5] + [0.0] * 9, n_envs=2, n_episodes=100)
+    assert penalty.episodes.expected_cost == pytest.approx(0.5, rel=0.05)
+    assert penalty.budget == pytest.approx(discounted_budget(1.0, 0.97, 20))
+    assert penalty.multiplier.item() == pytest.approx(0.05)
+
+
+def test_long_episodes_with_a_cost_are_not_taken_for_short_ones() -> None:
+    """Half of the episodes are short and free, half are long and cost 1: half a cost an episode."""
+    record = EpisodeRecord(cost_gamma=0.9, episode_length=1000, window=50, road_steps=2200)
+    for _ in range(40):
+        drive(record, [0.0] * 20, done_every=20)
+        drive(record, [0.0] * 100 + [1.0] + [0.0] * 99, done_every=200)
+    assert record.expected_cost == pytest.approx(0.5, rel=0.1)
+
+
+def test_a_strict_limit_does_not_wind_up_where_nothing_happens() -> None:
+    """Critics never say exactly 0; where the road agrees with a limit of 0 that is no reason to grow."""
+    penalty = make_penalty(cost_limit=0.0, cost_gamma=0.9, lagrangian_multiplier_init=2.0)
+    observe_episodes(penalty, cost=0.0, n=400)
+    penalty.note_prediction(th.full((4,), 0.002))
+    for _ in range(1000):
+        penalty.update(0.004)
+    assert penalty.calibrated and penalty.multiplier.item() == 2.0
+
+
+def test_combine_and_update_find_the_constrained_optimum() -> None:
+    """
+    Speed v is worth v, and ends an episode of 10 steps by a cost with the chance v^2.
+
+    The best v with v^2 <= .16 is .4, and there the price of a cost is 1 / 2v = 1.25 (Karush, Kuhn, Tucker).
+    """
+    penalty = make_penalty(cost_limit=0.16, lambda_lr=0.02, episode_length=10, road_steps=2000, min_episodes=20)
+    speed, rng, recent = th.tensor(0.9), np.random.default_rng(0), []
+    for _ in range(4000):
+        crashes = rng.random(20) < speed.item() ** 2
+        for step in range(10):
+            last = np.full(20, step == 9)
+            penalty.observe(crashes * last, last)
+        penalty.note_prediction(th.full((20,), speed.item() ** 2))
+        penalty.update(speed.item() ** 2 - penalty.budget)
+        speed.requires_grad_()
+        (slope,) = th.autograd.grad(penalty.combine(-speed, speed**2, th.tensor(-1.0)), speed)
+        speed = (speed - 0.05 * slope).clamp(0.01, 1.0).detach()
+        recent.append((speed.item(), penalty.multiplier.item()))
+    mean_speed, mean_multiplier = np.mean(recent[2000:], axis=0)
+    assert mean_speed == pytest.approx(0.4, abs=0.03)
+    assert mean_multiplier == pytest.approx(1.25, abs=0.15)
 
 
 def test_multiplier_stays_above_its_lower_bound() -> None:
@@ -228,7 +300,7 @@ def drive(record: EpisodeRecord, costs: list[float], done_every: int) -> None:
 def test_road_signal_is_the_present_rate_over_an_episode_of_full_length() -> None:
     record = EpisodeRecord(cost_gamma=0.5, episode_length=10, window=50, road_steps=500)
     drive(record, [0.0, 0.0, 0.0, 0.0, 1.0] * 40, done_every=5)
-    assert record.expected_cost == pytest.approx(2.0, rel=0.02)
+    assert record.expected_cost == pytest.approx(2.0, rel=0.02)  # without a crash they would have lasted for ten steps
     assert record.tail_cost(0.5) == pytest.approx(record.expected_cost)  # all episodes alike: no tail
     drive(record, [0.0] * 20, done_every=20)
     assert record.episode_length == 20  # of the cost-free episodes, crashes do not shorten it
@@ -370,5 +442,7 @@ def test_make_entropy_coefficient() -> None:
 
 @pytest.mark.parametrize("value", ["automatic", "auto_x", "auto_7", "auto_-1", -0.1])
 def test_refuses_unknown_coefficients(value: Any) -> None:
+    with pytest.raises(ValueError, match=r"ent_coef is 5.0; choose it within its bounds 0.0001 and 1.0"):
+        make_entropy_coefficient("auto_5", -1.0)
     with pytest.raises(ValueError, match=r"ent_coef is .*; choose"):
         make_entropy_coefficient(value, -1.0)

@@ -117,6 +117,17 @@ def test_a_broken_memory_is_forgotten_at_the_start_of_an_episode() -> None:
     np.testing.assert_array_equal(action, model.predict(observation, deterministic=True)[0])
 
 
+def test_a_memory_that_went_through_plain_numbers_is_taken() -> None:
+    """Lists, as JSON has them, come back as doubles."""
+    model = make_model("MlpPolicy")
+    first, second = observe(model, n_envs=1, steps=2)
+    _, state = model.predict(first, deterministic=True)
+    doubles = tuple(np.array(array.tolist()) for array in state or ())
+    assert doubles[0].dtype == np.float64
+    expected, _ = model.predict(second, state, deterministic=True)
+    np.testing.assert_array_equal(model.predict(second, doubles, deterministic=True)[0], expected)
+
+
 def test_deterministic_means_the_same_each_time() -> None:
     model = make_model("MlpPolicy")
     (observation,) = observe(model, n_envs=4, steps=1)

@@ -10,7 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad import ESADLEND
 from sb3_esad.__main__ import make_parser
-from sb3_esad.driving_evaluation import DRIVERS
+from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.hyperparams import constructor_arguments
 
 ROOT = Path(__file__).parents[1]

@@ -15,13 +15,10 @@ def test_equals_the_sum_over_a_list_of_the_latest_steps(at_once: int) -> None:
         n = round(sums["steps"]) // at_once
         assert sums["costs"] == pytest.approx(sum(history[-n:]), rel=1e-4)
     assert 180 <= sums["steps"] <= 200
-    assert sums.fullness == 1.0
 
 
-def test_what_is_not_named_stays_and_the_window_fills() -> None:
+def test_what_is_not_named_stays() -> None:
     sums = RecentSums(("costs", "predicted"), steps=100, blocks=2)
-    assert sums.fullness == 0.0
     sums.add(20, costs=1.0)
     sums.add(0, predicted=3.0)
     assert (sums["steps"], sums["costs"], sums["predicted"]) == (20.0, 1.0, 3.0)
-    assert sums.fullness == pytest.approx(20 / 50)

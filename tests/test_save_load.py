@@ -130,11 +130,24 @@ def test_memory_of_the_environment_is_not_saved(tmp_path: Path) -> None:
         assert ESADLEND.load(tmp_path / "model", device="cpu")._last_latent is None
 
 
-@pytest.mark.parametrize("arguments", [{"cost_limit": None}, {"ent_coef": 0.1}], ids=str)
-def test_arguments_that_do_not_fit_the_saved_networks(arguments: dict[str, Any], tmp_path: Path) -> None:
+def test_arguments_that_do_not_fit_the_saved_networks(tmp_path: Path) -> None:
     train(ent_coef="auto_0.5").save(tmp_path / "model")
     with pytest.raises(ValueError, match="model was saved by another version of sb3_esad, or the arguments given to load"):
-        ESADLEND.load(tmp_path / "model", device="cpu", **arguments)
+        ESADLEND.load(tmp_path / "model", device="cpu", ent_coef=0.1)
+
+
+@pytest.mark.parametrize(("saved", "loaded"), [(0.3, None), (None, 0.3), (0.3, 0.1)])
+def test_a_limit_may_come_and_go(saved: float | None, loaded: float | None, tmp_path: Path) -> None:
+    """The multiplier of a limit is kept under another one, and begins anew where there was none."""
+    model = train(cost_limit=saved)
+    for value in model.penalty.state_dict().values():
+        value.fill_(1.5)
+    model.save(tmp_path / "model")
+    other = ESADLEND.load(tmp_path / "model", device="cpu", cost_limit=loaded, lagrangian_multiplier_init=3.0)
+    multiplier = other.penalty.state_dict().get("multiplier")
+    assert (None if multiplier is None else multiplier.item()) == {(0.3, None): None, (None, 0.3): 3.0}.get(
+        (saved, loaded), 1.5
+    )
 
 
 def test_the_reason_is_the_first_error(tmp_path: Path) -> None:

@@ -1,6 +1,8 @@
 """Saved models: written as a whole or not at all, and refused with a reason."""
 
+import base64
 import io
+import json
 import zipfile
 from pathlib import Path
 
@@ -127,6 +129,22 @@ def test_load_refuses_a_zip_without_a_model(tmp_path: Path, members: dict[str, s
             archive.writestr(name, text)
     with pytest.raises(ValueError, match=r"photos\.zip holds no model of Stable-Baselines3"):
         ESADLEND.load(path)
+
+
+def test_load_refuses_members_that_hold_something_else(saved: Path, tmp_path: Path) -> None:
+    """A zip that is whole but was written by something else, or by a version whose modules had other names."""
+    forgeries = {"policy.pth": b"these are no tensors"}
+    with zipfile.ZipFile(saved) as archive:
+        members = {name: archive.read(name) for name in archive.namelist()}
+    data = json.loads(members["data"])
+    data["policy_class"][":serialized:"] = base64.b64encode(b"csb3_esad.former_module\nLatentPolicy\n.").decode()
+    forgeries["data"] = json.dumps(data).encode()
+    for name, content in forgeries.items():
+        with zipfile.ZipFile(tmp_path / "forged.zip", "w") as archive:
+            for member, original in members.items():
+                archive.writestr(member, content if member == name else original)
+        with pytest.raises(ValueError, match="was saved by another version of sb3_esad"):
+            ESADLEND.load(tmp_path / "forged.zip", device="cpu")
 
 
 def test_load_refuses_another_algorithm(tmp_path: Path) -> None:

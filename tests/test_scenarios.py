@@ -25,8 +25,8 @@ from sb3_esad.envs.obstacles import NOWHERE, ObstacleAvoidance
 from sb3_esad.envs.right_of_way import RightOfWay
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
-from sb3_esad.envs.town import Town03, Town06, Town07, Town10
-from sb3_esad.envs.towns import MAPS, town
+from sb3_esad.envs.town_drive import Town03, Town04, Town06, Town07, Town10
+from sb3_esad.envs.towns import PLANS, town
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
 
@@ -36,6 +36,7 @@ SCENARIOS: dict[str, type[Scenario]] = {
     "obstacle-avoidance": ObstacleAvoidance,
     "braking": Braking,
     "town03": Town03,
+    "town04": Town04,
     "town06": Town06,
     "town07": Town07,
     "town10": Town10,
@@ -192,7 +193,8 @@ def test_ways_through_a_junction_cross_or_not() -> None:
 
 
 def test_people_beside_a_junction_hold_up_nobody() -> None:
-    road, arriving, ways, crossings = crossroads()
+    road, streets, ways, crossings = crossroads()
+    arriving = [towards for _, towards in streets]
     way = next(each for each in ways if each.source == arriving[0].exits[0])
     start, heading = tuple(road.position(way.source, 235.0).tolist()), float(road.heading[way.source])
     car = User(start, heading, 8.0, 10.0, path=(way.source, *way.lanes, way.target))
@@ -207,8 +209,7 @@ def test_people_beside_a_junction_hold_up_nobody() -> None:
 
 def test_everybody_gets_through_the_junction() -> None:
     env, reference = make("esad-traffic-negotiation-vector-v0", config={"duration": 90.0}), ReferenceDriver()
-    arriving = crossroads().arriving
-    before = [lane.exits[0] for lane in arriving]
+    before = [towards.exits[0] for _, towards in crossroads().streets]
     for seed in range(4):
         env.reset(seed=seed)
         for _ in range(350):
@@ -234,11 +235,13 @@ def test_the_reference_driver_finds_its_way(name: str) -> None:
     assert reference["DS"] >= 95
 
 
-@pytest.mark.parametrize("name", MAPS)
+@pytest.mark.parametrize("name", PLANS)
 def test_lanes_of_a_town_lead_on_where_they_end(name: str) -> None:
     road, _, ways, _ = town(name)
     for way in ways:
-        for lane, following in itertools.pairwise((way.source, *way.lanes, way.target)):
+        for lane, chosen in itertools.pairwise((way.source, *way.lanes, way.target)):
+            continuing = int(road.following[lane])
+            following = continuing if road.row_of[chosen] == road.row_of[continuing] else chosen  # then one changes lane
             np.testing.assert_allclose(road.end(lane), road.start[following], atol=1e-6)
             turned = road.lanes[lane].heading_at(float(road.length[lane])) - road.heading[following]
             assert math.remainder(turned, 2 * math.pi) == pytest.approx(0.0, abs=1e-6)

@@ -15,14 +15,15 @@ from sb3_esad.common.save_util import whole_file
 
 def prepend(first: BaseCallback, callback: MaybeCallback) -> list[BaseCallback]:
     """
-    Put a callback before those of the user.
+    Put a callback before those of the user, unless there is one of its kind among them.
 
     :param first: the callback that runs first
     :param callback: what ``learn`` accepts: nothing, a callback, a list of them or a function
     :return: all callbacks
     """
-    others = callback if isinstance(callback, list) else [callback]
-    return [first, *(each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in others)]
+    given = callback if isinstance(callback, list) else [callback]
+    others = [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in given]
+    return others if any(type(each) is type(first) for each in others) else [first, *others]
 
 
 class LagrangeCallback(BaseCallback):
@@ -41,10 +42,11 @@ class LagrangeCallback(BaseCallback):
             self.model.penalty.forget_unfinished()
 
     def _on_step(self) -> bool:
-        dones = self.locals["dones"]
+        dones, infos = self.locals["dones"], self.locals["infos"]
         # What random actions have cost says nothing about the policy
         if self.num_timesteps - len(dones) >= self.model.learning_starts:
-            self.model.penalty.observe(self.model.replay_buffer.read_costs(self.locals["infos"]), dones)
+            truncated = np.array([info.get("TimeLimit.truncated", False) for info in infos])
+            self.model.penalty.observe(self.model.replay_buffer.read_costs(infos), dones, truncated)
         else:
             self.model.penalty.pass_over(dones)
         return True

@@ -107,10 +107,9 @@ def make_entropy_coefficient(ent_coef: str | float, target_entropy: float, learn
     :raises ValueError: if ``ent_coef`` is neither
     """
     name, _, init = str(ent_coef).partition("_")
+    learned = name == "auto"
     try:
-        if name == "auto":
-            return LearnedCoefficient(target_entropy, float(init or 1.0), learning_rate=learning_rate)
-        value = float(ent_coef)
+        value = float(init or 1.0) if learned else float(ent_coef)
     except ValueError as error:
         raise ValueError(f'ent_coef is {ent_coef!r}; choose a number, "auto", or "auto_0.1" to start from 0.1.') from error
-    return FixedCoefficient(value)
+    return LearnedCoefficient(target_entropy, value, learning_rate=learning_rate) if learned else FixedCoefficient(value)

@@ -16,24 +16,25 @@ class EpisodeRecord(nn.Module):
     What the present policy costs; it is part of the saved model, hence made of buffers.
 
     :param cost_gamma: discount of the costs
-    :param episode_length: in steps, assumed until cost-free episodes have been seen
+    :param episode_length: in steps, assumed until an episode has ended otherwise than by a cost
     :param window: number of episodes remembered for the spread of their costs
-    :param road_steps: steps over which cost and predictions are averaged
+    :param road_steps: steps over which cost and predictions are averaged; more if two episodes of each environment are longer
     """
 
     costs: th.Tensor
     n_episodes: th.Tensor
-    n_cost_free: th.Tensor
+    n_ended: th.Tensor
     mean_length: th.Tensor
 
     def __init__(self, cost_gamma: float, episode_length: float, window: int, road_steps: int = 2000) -> None:
         super().__init__()
         self.cost_gamma = cost_gamma
         self.window = window
+        self.road_steps = road_steps
         self.recent = RecentSums(("costs", "costs_to_come", "predicted", "predictions"), road_steps)
         self.register_buffer("costs", th.zeros(window))
         self.register_buffer("n_episodes", th.zeros(()))
-        self.register_buffer("n_cost_free", th.zeros(()))
+        self.register_buffer("n_ended", th.zeros(()))
         self.register_buffer("mean_length", th.tensor(float(episode_length)))
         self.forget_unfinished()
 
@@ -50,27 +51,31 @@ class EpisodeRecord(nn.Module):
 
     @property
     def episode_length(self) -> float:
-        """Mean length of the cost-free episodes; a crash shortens its episode and would make the budget look larger."""
+        """Mean length of the episodes that no cost has ended, for a crash would make the budget look larger."""
         return max(self.mean_length.item(), 1.0)
 
-    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+    def observe(self, costs: np.ndarray, dones: np.ndarray, truncated: np.ndarray | None = None) -> None:
         """
         Add one step of all environments.
 
         :param costs: (n_envs,)
         :param dones: (n_envs,)
+        :param truncated: (n_envs,), whether only time was up; None for none
         """
         if len(costs) != len(self._weights):
             self._weights = np.zeros(len(costs))
         if len(costs) != len(self._whole):
             self._whole = np.ones(len(costs), dtype=bool)
+        # Environments in step with each other would else show many steps of the same part of an episode
+        self.recent.steps = max(self.road_steps, math.ceil(2 * self._steps_of_episodes))
         # A cost counts in the discounted cost to come of every earlier step of its episode: 1 + gamma + gamma^2 + ...
         self._weights = 1.0 + self.cost_gamma * self._weights
         self.recent.add(len(costs), costs=costs.sum(), costs_to_come=(self._weights * costs).sum())
         self._weights[np.asarray(dones, dtype=bool)] = 0.0
+        ended_by_cost = (costs > 0) if truncated is None else (costs > 0) & ~np.asarray(truncated, dtype=bool)
         for episode in self._under_way.add(costs, dones):
             if self._whole[episode.env]:
-                self._remember(episode)
+                self._remember(episode, bool(ended_by_cost[episode.env]))
             self._whole[episode.env] = True
 
     def pass_over(self, dones: np.ndarray) -> None:
@@ -81,12 +86,12 @@ class EpisodeRecord(nn.Module):
         """
         self._whole = np.array(dones, dtype=bool)
 
-    def _remember(self, episode: FinishedEpisode) -> None:
+    def _remember(self, episode: FinishedEpisode, ended_by_cost: bool) -> None:
         self.costs[int(self.n_episodes) % self.window] = episode.cost
         self.n_episodes += 1
-        if episode.cost == 0:
-            self.n_cost_free += 1
-            self.mean_length += (episode.length - self.mean_length) / self.n_cost_free.clamp(max=self.window)
+        if not ended_by_cost:
+            self.n_ended += 1
+            self.mean_length += (episode.length - self.mean_length) / self.n_ended.clamp(max=self.window)
 
     @th.no_grad()
     def note_prediction(self, values: th.Tensor) -> None:
@@ -114,9 +119,19 @@ class EpisodeRecord(nn.Module):
         return (predicted + epsilon) / (observed + epsilon)
 
     @property
+    def _steps_of_episodes(self) -> float:
+        """Steps of all environments in which each of them drives an episode of usual length."""
+        return len(self._weights) * self.episode_length
+
+    @property
     def seen(self) -> float:
-        """How much of the latest steps has been seen, from 0 to 1."""
-        return self.recent.fullness
+        """How many of the ``road_steps`` have been seen, from 0 to 1."""
+        return min(self.recent["steps"] / (self.road_steps * (1 - 1 / len(self.recent.blocks))), 1.0)
+
+    @property
+    def has_seen_episodes(self) -> bool:
+        """Whether enough steps have been seen for an episode of each environment."""
+        return self.recent["steps"] >= self._steps_of_episodes
 
     @property
     def expected_cost(self) -> float:

@@ -23,13 +23,13 @@ class AugmentedLagrangian(Penalty):
     psi(g) for the constraint g <= 0 (Nocedal & Wright 2006, Eq. 17.65), g = Gamma - d.
 
     The multiplier integrates two signals, each normalised and clipped: what the critics expect and what the road has shown.
-    It holds still where they disagree, where neither is available and during a warm-up, lest it wind up on a violation
-    that the actor cannot, or need not, mend.
+    It holds still where they disagree or one of them is content, where neither is available and during a warm-up, lest it wind
+    up on a violation that the actor cannot, or need not, mend.
 
     :param cost_limit: D >= 0, undiscounted cost allowed per episode
     :param risk_level: alpha in (0, 1], worst fraction of episodes that shall keep the limit
     :param cost_gamma: discount of the cost
-    :param episode_length: steps of an episode, assumed until cost-free ones have been seen
+    :param episode_length: steps of an episode, assumed until one has ended otherwise than by a cost
     :param barrier_coef: weight of the violated barrier condition
     :param lambda_lr: step of the multiplier per update, its integral gain
     :param lagrangian_multiplier_init: initial multiplier
@@ -37,7 +37,7 @@ class AugmentedLagrangian(Penalty):
     :param penalty_coef: rho >= 0, the proportional gain; 0 is the plain Lagrangian
     :param penalty_warmup: updates during which the multiplier holds still
     :param window: episodes remembered
-    :param road_steps: steps over which the present cost rate is averaged
+    :param road_steps: steps over which the present cost rate is averaged; more if two episodes of each environment are longer
     :param min_episodes: finished episodes without which the critics are not trusted
     :param calibration_band: predicted over observed cost within which the critics are trusted
     :raises ValueError: if an argument is out of its range
@@ -134,8 +134,8 @@ class AugmentedLagrangian(Penalty):
         # The scale, not the budget: under a limit of 0 no estimate is ever exactly 0.
         return (risk <= self.budget_scale) & (barrier <= 0.0)
 
-    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
-        self.episodes.observe(costs, dones)
+    def observe(self, costs: np.ndarray, dones: np.ndarray, truncated: np.ndarray | None = None) -> None:
+        self.episodes.observe(costs, dones, truncated)
 
     def pass_over(self, dones: np.ndarray) -> None:
         self.episodes.pass_over(dones)
@@ -165,13 +165,14 @@ class AugmentedLagrangian(Penalty):
             excess = self.episodes.tail_cost(self.risk_level) - self.cost_limit
             # Bounded below a single cost the signal would be a switch, and rest at twice the cost that is allowed
             single = self.episodes.resolution / self.risk_level
-            signals["violation_road"] = excess / max(self.cost_limit, single, 0.02)
+            if excess >= 0 or self.episodes.has_seen_episodes:  # that nothing has happened yet says nothing
+                signals["violation_road"] = excess / max(self.cost_limit, single, 0.02)
         return {name: min(max(signal, -1.0), 1.0) for name, signal in signals.items()}
 
     def _move(self, signals: list[float], gradient_steps: int) -> None:
         mean = sum(signals) / len(signals)
         self.mean_violation += (1.0 - 0.9**gradient_steps) * (mean - self.mean_violation)
-        if min(signals) * max(signals) >= 0.0:
+        if min(signals) * max(signals) > 0.0:
             step = self.lambda_lr * gradient_steps * mean
             self.multiplier.add_(step).clamp_(self.lower_bound, self.upper_bound)
 

@@ -58,12 +58,13 @@ class Penalty(nn.Module, ABC):
         """
 
     @abstractmethod
-    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+    def observe(self, costs: np.ndarray, dones: np.ndarray, truncated: np.ndarray | None = None) -> None:
         """
         Take note of one step of the environments.
 
         :param costs: (n_envs,)
         :param dones: (n_envs,)
+        :param truncated: (n_envs,), whether only time was up; None for none
         """
 
     @abstractmethod
@@ -121,7 +122,7 @@ class NoPenalty(Penalty):
     def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
         return th.ones_like(risk, dtype=th.bool)
 
-    def observe(self, costs: np.ndarray, dones: np.ndarray) -> None:
+    def observe(self, costs: np.ndarray, dones: np.ndarray, truncated: np.ndarray | None = None) -> None:
         pass
 
     def pass_over(self, dones: np.ndarray) -> None:

@@ -86,6 +86,8 @@ class LatentPolicy(BasePolicy):
         self.actor_arch, self.critic_arch = get_actor_critic_arch(self.net_arch)
         complete = len(self.actor_arch) > 0 and len(self.critic_arch) > 0
         require(complete, "net_arch", net_arch, "at least one hidden layer for the actor and for the critics")
+        for name, channels in (("memory_channels", memory_channels), ("latent_channels", latent_channels)):
+            require(channels is None or channels >= 1, name, channels, "a number >= 1, or None for the usual one")
         self.memory_channels = memory_channels
         self.latent_channels = latent_channels
         self.world_model_kwargs = world_model_kwargs or {}
@@ -113,8 +115,10 @@ class LatentPolicy(BasePolicy):
         extractor = self.make_features_extractor()
         embedding_channels, height, width = grid_shape(extractor)
         spatial = height * width > 1
-        memory_shape = (self.memory_channels or (32 if spatial else 256), height, width)
-        latent_channels = self.latent_channels or (8 if spatial else 32)
+        memory_channels, latent_channels = (32, 8) if spatial else (256, 32)
+        memory_channels = memory_channels if self.memory_channels is None else self.memory_channels
+        latent_channels = latent_channels if self.latent_channels is None else self.latent_channels
+        memory_shape = (memory_channels, height, width)
         head = self.head_class(
             memory_shape, embedding_channels, latent_channels, hidden_channels=memory_shape[0], **self.head_kwargs
         )
@@ -215,7 +219,7 @@ class LatentPolicy(BasePolicy):
         if shapes != expected:
             remedy = "pass what the last call returned for these environments, or None to start afresh"
             raise ValueError(f"predict() was given {n_envs} observation(s) with a state of shapes {shapes}: {remedy}.")
-        fields = (th.as_tensor(array[0], device=self.device) for array in state)
+        fields = (th.as_tensor(array[0], dtype=th.float32, device=self.device) for array in state)
         return LatentState(*(field.view_as(zeros) for field, zeros in zip(fields, initial, strict=True)))
 
     @staticmethod

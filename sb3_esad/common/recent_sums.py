@@ -47,8 +47,3 @@ class RecentSums(nn.Module):
         :return: its sum
         """
         return self.blocks[:, self.names.index(name)].sum().item()
-
-    @property
-    def fullness(self) -> float:
-        """How much of the window has been seen, from 0 to 1."""
-        return min(self["steps"] / (self.steps * (1 - 1 / len(self.blocks))), 1.0)

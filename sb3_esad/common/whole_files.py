@@ -49,7 +49,9 @@ class WholeFiles(OffPolicyAlgorithm):
         check_saved_model(path, cls.__name__, mark=cls.saved_mark)
         try:
             return super().load(path, *args, **kwargs)
-        except (KeyError, RuntimeError) as error:
+        except ValueError:
+            raise
+        except Exception as error:  # what is read may be anything
             reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
             # SB3 looks for another cause of a ValueError, in vain, and raises what it stumbles over
             cause = error.__context__ if isinstance(error.__context__, ValueError) else error

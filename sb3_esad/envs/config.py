@@ -8,6 +8,35 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from sb3_esad.envs.lanes import CAR_LENGTH
+from sb3_esad.envs.users import CAR_WIDTH
+
+COMMON: dict[str, Any] = {
+    "duration": 40.0,
+    "policy_frequency": 5,
+    "physics_frequency": 10,
+    "target_speed": 25.0,
+    "max_speed": 30.0,
+    "max_acceleration": 3.0,
+    "max_braking": 6.0,
+    "max_wheel_angle": 0.5,
+    "max_lateral_acceleration": 4.0,
+    "vehicle_size": (CAR_LENGTH, CAR_WIDTH),
+    "reward_weights": {"velocity": 0.7, "lane": 0.2, "orientation": 0.1, "exploration": 0.0},
+    "velocity_sharpness": 0.2,
+    "orientation_sharpness": 5.0,
+    "lane_tolerance": 2.0,
+    "exploration_decay": 0.1,
+    "graded_cost": False,
+    "graded_cost_ttc": 1.5,
+    "image_shape": (64, 64),
+    "metres_per_pixel": (1.25, 0.4),
+    "ahead": 0.775,
+    "frame": "lane",
+    "neighbours": 8,
+}
+"""What all scenarios have in common, with units in SI."""
+
 
 class Rule(NamedTuple):
     """

@@ -46,8 +46,6 @@ def _room(x: float, y: float, side: float, other: User) -> float:
 class Course(Scenario):
     """Reach the goal 40 to 50 m ahead at 2 m/s among obstacles, sparse to dense. See :class:`Scenario`."""
 
-    has_lanes = False
-
     @classmethod
     def default_config(cls) -> dict[str, Any]:
         """See :meth:`Scenario.default_config`."""

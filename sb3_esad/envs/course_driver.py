@@ -2,20 +2,21 @@
 
 import heapq
 import math
+from typing import Any
 
+import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.scenario import Scenario
+from sb3_esad.envs.scenario import Scenario, scenario_of
 from sb3_esad.envs.users import Kind
 
 CELL, INFLATION = 0.25, 0.75  # of the grid on which the way to the goal is searched, and of what is in the way there [m]
 STEP, STEPS = 0.2, 14  # of the arcs [s]
 WHEELS, SPEEDS = np.linspace(-1.0, 1.0, 17), np.array([0.0, 0.5, 1.0, 1.5, 2.0])  # [full lock], [m/s]
 CONTACT, COMFORT = 0.12, 0.6  # room to others that an arc must leave, and that it had better leave [m]
-REACTION = 0.8  # people may stop or go on; they are kept away from as if they went on a little longer [s]
 
 
 class CourseDriver:
@@ -24,13 +25,14 @@ class CourseDriver:
     def __init__(self) -> None:
         self._episode: object = None
 
-    def act(self, scenario: Scenario) -> NDArray[np.float32]:
+    def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
         """
         Choose an action.
 
-        :param scenario: without lanes
+        :param env: an indoor course, wrapped or not
         :return: acceleration and steering, shape ``(2,)``
         """
+        scenario = scenario_of(env)
         if scenario.episode is not self._episode:
             self._episode, self._field = scenario.episode, distance_to_goal(scenario)
         traffic, speed = scenario.traffic, float(scenario.traffic.speed[EGO])
@@ -64,7 +66,7 @@ class CourseDriver:
 
 def clearance(scenario: Scenario, places: Floats, headings: Floats) -> Floats:
     """
-    Room that the ego vehicle would have on its way, people going on as they do.
+    Room that the ego vehicle would have on its way, whether people go on as they do or stop.
 
     :param scenario: with the others where they are now
     :param places: of its centre, shape ``(arcs, steps, 2)`` [m]
@@ -74,8 +76,10 @@ def clearance(scenario: Scenario, places: Floats, headings: Floats) -> Floats:
     traffic, (length, width) = scenario.traffic, scenario.controls.vehicle_size
     rows = np.arange(1, len(traffic.speed))
     times = STEP * np.arange(1, places.shape[1] + 1)
-    others = traffic.position[rows] + times[:, None, None] * traffic.velocity[rows]
-    half = traffic.size[rows] / 2 + (traffic.kind[rows] == Kind.PERSON)[:, None] * 0.15
+    going_on = traffic.position[rows] + times[:, None, None] * traffic.velocity[rows]
+    stopping = np.broadcast_to(traffic.position[rows], going_on.shape)
+    others = np.concatenate([going_on, stopping], axis=1)
+    half = np.tile(traffic.size[rows] / 2 + (traffic.kind[rows] == Kind.PERSON)[:, None] * 0.15, (2, 1))
     offsets = np.linspace(-0.5, 0.5, 3) * (length - width)
     rooms = []
     for offset in offsets.tolist():

@@ -1,36 +1,26 @@
 """Scripted drivers that set the marks for a scenario; some read the simulator's state, which an agent cannot."""
 
+from collections.abc import Callable
 from typing import Any
 
 import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
+from sb3_esad.envs.course import Course
 from sb3_esad.envs.course_driver import CourseDriver
 from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.scenario import Scenario
+from sb3_esad.envs.scenario import Scenario, scenario_of
+from sb3_esad.envs.traffic import GET_BACK
+
+Driver = Callable[[gymnasium.Env[Any, Any]], NDArray[np.float32]]
 
 HEADING_GAIN, LATERAL_GAIN = 2.5, 0.7  # gentler than the traffic's, for who decides 5 times a second [1/s]
-GET_BACK = 100.0  # from here on to the end of a lane it is time to be on the lane that leads on [m]
 FALL_BACK = 2.0  # gently [m/s^2]
 CREEP_SPEED, CREEP_ROOM = 3.0, 6.5  # [m/s], between centres [m]
 SETTLED_OFFSET, SETTLED_HEADING = 0.5, 0.05  # a lane change is over within these [m], [rad]
 _SELF = np.array([EGO])
-
-
-def scenario_of(env: gymnasium.Env[Any, Any]) -> Scenario:
-    """
-    The scenario inside its wrappers.
-
-    :param env: a scenario, wrapped or not
-    :return: the scenario
-    :raises TypeError: if it is none
-    """
-    scenario = env.unwrapped
-    if not isinstance(scenario, Scenario):
-        raise TypeError(f"{scenario} is no driving scenario; scripted drivers need one of sb3_esad.envs")
-    return scenario
 
 
 class SpeedKeeper:
@@ -80,12 +70,6 @@ class ReferenceDriver(CarFollower):
     def __init__(self) -> None:
         self._episode: object = None
         self._target = NO_LANE
-        self._where_no_lanes_are = CourseDriver()
-
-    def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
-        """See :meth:`SpeedKeeper.__call__`."""
-        scenario = scenario_of(env)
-        return super().__call__(env) if scenario.has_lanes else self._where_no_lanes_are.act(scenario)
 
     def _lane(self, scenario: Scenario) -> int:
         traffic, lane = scenario.traffic, int(scenario.traffic.lane[EGO])
@@ -149,3 +133,12 @@ class RandomDriver:
     def __call__(self, env: gymnasium.Env[Any, Any]) -> NDArray[np.float32]:
         """See :meth:`SpeedKeeper.__call__`."""
         return self._random.uniform(-1.0, 1.0, 2).astype(np.float32)
+
+
+DRIVERS: dict[str, Callable[[Scenario, int], Driver]] = {
+    "reference": lambda scenario, seed: CourseDriver() if isinstance(scenario, Course) else ReferenceDriver(),
+    "follower": lambda scenario, seed: CarFollower(),
+    "keeper": lambda scenario, seed: SpeedKeeper(),
+    "random": lambda scenario, seed: RandomDriver(seed),
+}
+"""Makes a scripted driver for an episode of a scenario with a seed."""

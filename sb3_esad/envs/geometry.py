@@ -15,7 +15,8 @@ def wrap_angle(angle: Floats) -> Floats:
     :param angle: angles of any shape [rad]
     :return: the same directions, in [-pi, pi)
     """
-    return (angle + np.pi) % (2 * np.pi) - np.pi
+    turned = angle + np.pi
+    return turned - 2 * np.pi * np.floor(turned / (2 * np.pi)) - np.pi  # several times faster than %
 
 
 def box_corners(position: Floats, heading: Floats, size: Floats) -> Floats:

@@ -1,55 +1,39 @@
 """Traffic negotiation: a junction of four streets without lights, and cars from everywhere."""
 
 from functools import cache
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from sb3_esad.envs.network_drive import NetworkDrive
-from sb3_esad.envs.networks import Carriageway, Network, Way
+from sb3_esad.envs.networks import Network, Way
 from sb3_esad.envs.pieces import Piece
 from sb3_esad.envs.population import Population
 from sb3_esad.envs.right_of_way import Crossings, RightOfWay
 from sb3_esad.envs.roads import Road
+from sb3_esad.envs.town_plan import Town
 from sb3_esad.envs.users import User
 
 ARM_LENGTH, HALF_SIZE = 250.0, 14.0  # of the streets, and of the junction [m]
 SPEED_LIMIT = 12.0  # [m/s]
 
 
-class Crossroads(NamedTuple):
-    """
-    The junction; street k leads to the east, south, west, north for k = 0 to 3.
-
-    :param road: its lanes
-    :param arriving: lanes to the junction, one carriageway for each street
-    :param ways: through the junction
-    :param crossings: of these
-    """
-
-    road: Road
-    arriving: tuple[Carriageway, ...]
-    ways: tuple[Way, ...]
-    crossings: Crossings
-
-
 @cache
-def crossroads() -> Crossroads:
+def crossroads() -> Town:
     """
     Build the junction, once per process.
 
-    :return: the junction, which nobody must change
+    :return: street k, lanes away from the junction first, leads to the east, south, west, north for k = 0 to 3; nobody must
+        change it
     """
-    network, leaving, arriving = Network(), [], []
+    network, streets = Network(), []
     for street in range(4):
         direction = street * np.pi / 2
         start = (HALF_SIZE * float(np.cos(direction)), HALF_SIZE * float(np.sin(direction)))
-        away, towards = network.street([Piece(start, direction, ARM_LENGTH)], 1, 1, SPEED_LIMIT)
-        leaving.append(away)
-        arriving.append(towards)
-    network.junction(arriving, leaving, SPEED_LIMIT)
+        streets.append(network.street([Piece(start, direction, ARM_LENGTH)], 1, SPEED_LIMIT))
+    network.junction([towards for _, towards in streets], [away for away, _ in streets], SPEED_LIMIT)
     road, ways = network.road(), tuple(network.ways)
-    return Crossroads(road, tuple(arriving), ways, Crossings(road, ways))
+    return Town(road, tuple(streets), ways, Crossings(road, ways))
 
 
 class TrafficNegotiation(NetworkDrive):
@@ -67,17 +51,21 @@ class TrafficNegotiation(NetworkDrive):
         return self.crossroads.road
 
     def _plan(self) -> tuple[list[int], float, float]:
-        random, source = self.np_random, self.crossroads.arriving[int(self.np_random.integers(4))].exits[0]
+        random, source = self.np_random, self._arriving()[int(self.np_random.integers(4))]
         way = self._draw_way(source)
         start = float(self.road.length[source] - random.uniform(*self.config["approach"]))
         return [source, *way.lanes, way.target], start, self.config["departure"]
+
+    def _arriving(self) -> list[int]:
+        """The lane to the junction of each street."""
+        return [towards.exits[0] for _, towards in self.crossroads.streets]
 
     def _draw_way(self, source: int) -> Way:
         ways = [way for way in self.crossroads.ways if way.source == source]
         return ways[self.np_random.integers(len(ways))]
 
     def _place_others(self, population: Population) -> list[User]:
-        return [car for street in self.crossroads.arriving for car in self._street_traffic(population, street.exits[0])]
+        return [car for lane in self._arriving() for car in self._street_traffic(population, lane)]
 
     def _street_traffic(self, population: Population, lane: int) -> list[User]:
         """Cars that come to the junction one after the other, each with a way to take."""

@@ -50,7 +50,7 @@ class NetworkDrive(Scenario):
 
     def _make_traffic(self) -> Traffic:
         config, lane = self.config, self.route.lanes[0]
-        speed = float(self.np_random.uniform(*config["start_speed"]))
+        speed = min(float(self.np_random.uniform(*config["start_speed"])), float(self.road.speed_limit[lane]))
         population = Population(self.np_random, self.road)
         x, y = self.road.position(lane, self._start).tolist()
         heading = self.road.lanes[lane].heading_at(self._start)

@@ -61,58 +61,82 @@ class Network:
         self.ways: list[Way] = []
         self._junctions = 0
         self._pieces: list[Piece] = []
-        self._links: list[dict[str, Any]] = []
+        self._rest: list[dict[str, Any]] = []
         self._lines: list[Floats] = []
         self._dashes: list[Floats] = []
 
     def street(
-        self, pieces: Sequence[Piece], forward: int, backward: int, speed_limit: float
+        self, pieces: Sequence[Piece], lanes: int, speed_limit: float, narrowest: float = LANE_WIDTH
     ) -> tuple[Carriageway, Carriageway]:
         """
         Add a street for both directions.
 
         :param pieces: of the line between the directions
-        :param forward: number of lanes along the pieces
-        :param backward: number of lanes against them
+        :param lanes: number of lanes in either direction
         :param speed_limit: [m/s]
+        :param narrowest: width of the lanes on all but the first and the last piece [m]
         :return: the lanes along the pieces, and those against them
         """
-        there = self.carriageway(pieces, forward, speed_limit)
-        return there, self.carriageway([piece.reversed() for piece in reversed(pieces)], backward, speed_limit)
+        there = self.carriageway(pieces, lanes, speed_limit, narrowest)
+        return there, self.carriageway([piece.reversed() for piece in reversed(pieces)], lanes, speed_limit, narrowest)
 
-    def carriageway(self, pieces: Sequence[Piece], count: int, speed_limit: float) -> Carriageway:
+    def carriageway(
+        self, pieces: Sequence[Piece], count: int, speed_limit: float, narrowest: float = LANE_WIDTH
+    ) -> Carriageway:
         """
         Add lanes of one direction.
 
         :param pieces: of the line at their left
         :param count: number of lanes
         :param speed_limit: [m/s]
+        :param narrowest: width of the lanes on all but the first and the last piece [m]
         :return: the lanes
         """
-        first = len(self._pieces)
+        first, last = len(self._pieces), len(pieces) - 1
         for number, piece in enumerate(pieces):
+            width = narrowest if 0 < number < last else LANE_WIDTH
             for place in range(count):
                 self._add(
                     piece.beside((place + 0.5) * LANE_WIDTH),
                     speed_limit,
                     left=len(self._pieces) - 1 if place > 0 else NO_LANE,
                     right=len(self._pieces) + 1 if place < count - 1 else NO_LANE,
-                    following=len(self._pieces) + count if number < len(pieces) - 1 else NO_LANE,
+                    following=len(self._pieces) + count if number < last else NO_LANE,
+                    width=width,
                 )
-            self._mark(piece, count)
+            self._mark(piece, count, (LANE_WIDTH - width) / 2)
         return Carriageway(tuple(tuple(range(first + place, len(self._pieces), count)) for place in range(count)))
 
-    def _add(self, piece: Piece, speed_limit: float, **links: int) -> None:
+    def _add(self, piece: Piece, speed_limit: float, **rest: float) -> None:
         in_bends = math.sqrt(COMFORTABLE / max(abs(piece.curvature), 1e-6))
         self._pieces.append(piece)
-        self._links.append({**links, "speed_limit": min(speed_limit, in_bends)})
+        self._rest.append({**rest, "speed_limit": min(speed_limit, in_bends)})
 
-    def _mark(self, piece: Piece, count: int) -> None:
-        self._lines += [facets(piece.beside(across)) for across in (0.0, count * LANE_WIDTH)]
+    def _mark(self, piece: Piece, count: int, inset: float) -> None:
+        self._lines += [facets(piece.beside(across)) for across in (inset, count * LANE_WIDTH - inset)]
         for place in range(1, count):
             between = piece.beside(place * LANE_WIDTH)
             for start in np.arange(0.0, between.length, DASH_PERIOD).tolist():
                 self._dashes.append(facets(between.cut(start, min(start + DASH_LENGTH, between.length))))
+
+    def follow(self, sources: Sequence[int], targets: Sequence[int]) -> None:
+        """
+        Let lanes that start where others end continue them.
+
+        :param sources: lanes that end
+        :param targets: the lane that starts where each of them ends
+        """
+        for source, target in zip(sources, targets, strict=True):
+            self._rest[source]["following"] = target
+
+    def choose(self, source: int, targets: Sequence[int]) -> None:
+        """
+        Let routes go on, past the end of a lane, on any of several lanes beside each other.
+
+        :param source: lane that ends
+        :param targets: the lane that continues it, and others beside that one
+        """
+        self.ways += [Way(source, target, (), self._junctions) for target in targets]
 
     def connect(self, source: int, target: int, speed_limit: float) -> None:
         """
@@ -131,8 +155,8 @@ class Network:
         first = len(self._pieces)
         for number, piece in enumerate(pieces, 1):
             self._add(piece, speed_limit, following=first + number if number < len(pieces) else target)
-        if self._links[source]["following"] == NO_LANE:
-            self._links[source]["following"] = first
+        if self._rest[source]["following"] == NO_LANE:
+            self._rest[source]["following"] = first
         self.ways.append(Way(source, target, tuple(range(first, len(self._pieces))), self._junctions))
 
     def junction(self, arriving: Sequence[Carriageway], leaving: Sequence[Carriageway], speed_limit: float) -> None:
@@ -191,8 +215,8 @@ class Network:
 
         :return: the lanes and what the drawings show of them
         """
-        lanes = [Lane(**asdict(piece), **links) for piece, links in zip(self._pieces, self._links, strict=True)]
-        surfaces = [surface(piece) for piece in self._pieces]
+        lanes = [Lane(**asdict(piece), **rest) for piece, rest in zip(self._pieces, self._rest, strict=True)]
+        surfaces = [surface(lane) for lane in lanes]
         lines = np.concatenate([np.zeros((0, 2, 2)), *self._dashes, *self._lines])
         is_dash = np.arange(len(lines)) < sum(map(len, self._dashes))
         along = np.repeat(np.arange(len(lanes)), [len(each) for each in surfaces])
@@ -211,12 +235,12 @@ def facets(piece: Piece) -> Floats:
     return np.stack([points[:-1], points[1:]], axis=1)
 
 
-def surface(piece: Piece) -> Floats:
+def surface(lane: Lane) -> Floats:
     """
     Draw the asphalt of a lane.
 
-    :param piece: its centre line
+    :param lane: where it is
     :return: convex pieces of four corners, shape ``(n, 4, 2)`` [m]
     """
-    left, right = facets(piece.beside(-LANE_WIDTH / 2)), facets(piece.beside(LANE_WIDTH / 2))
+    left, right = facets(lane.beside(-lane.width / 2)), facets(lane.beside(lane.width / 2))
     return np.concatenate([left, right[:, ::-1]], axis=1)

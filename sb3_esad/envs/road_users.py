@@ -39,23 +39,34 @@ class RoadUsers:
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
         self.wheel_angle = np.zeros(len(users))
-        self.next_lane, off_path = self._follow_paths(users)
+        self.has_path = np.array([bool(user.path) for user in users])
+        self.next_lane, self.towards_path, off_path = self._follow_paths(users)
         self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T
         self._rows = np.arange(len(users))
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
         self.target_lane[:] = self.lane
 
-    def _follow_paths(self, users: Sequence[User]) -> tuple[Ints, Floats]:
-        """The lane that each user takes after each lane, and what keeps it off lanes it will not take; ``(users, lanes)``."""
-        following = np.tile(self.road.following, (len(users), 1))
+    def _follow_paths(self, users: Sequence[User]) -> tuple[Ints, Ints, Floats]:
+        """
+        Read the paths; each array of shape ``(users, lanes)``.
+
+        :return: the lane that each user takes after each lane; the one to change to from there in order to be on its path; and
+            what keeps it off lanes it will not take [m]
+        """
+        road = self.road
+        following, towards = (np.tile(each, (len(users), 1)) for each in (road.following, np.arange(len(road.length))))
         off_path = np.zeros(following.shape)
         for row, user in enumerate(users):
             if user.path:
-                following[row, list(user.path[:-1])] = user.path[1:]
+                path, wanted = np.array(user.path[:-1], dtype=np.int64), np.array(user.path[1:], dtype=np.int64)
+                beside = road.row_of[road.following[path]] == road.row_of[wanted]  # there one changes lane instead
+                turns = (road.following[path] == NO_LANE) | ~beside
+                following[row, path[turns]] = wanted[turns]
+                towards[row] = road.towards(user.path)
                 off_path[row] = OFF_PATH
-                off_path[row, list(self.road.with_lanes_beside(user.path))] = 0.0
-        return following, off_path
+                off_path[row, list(road.with_lanes_beside(user.path))] = 0.0
+        return following, towards, off_path
 
     def _locate(self) -> None:
         road, count = self.road, len(self.speed)

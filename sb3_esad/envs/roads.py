@@ -64,6 +64,8 @@ class Road:
         self.left = np.array([lane.left for lane in lanes])
         self.right = np.array([lane.right for lane in lanes])
         self.following = np.array([lane.following for lane in lanes])
+        self.row_of = np.array([self.row(lane, self.left)[-1] for lane in range(len(lanes))])
+        """Lanes that one may change between have the same number here, that of the leftmost of them."""
         self._describe_arcs()
 
     def _describe_arcs(self) -> None:
@@ -133,6 +135,19 @@ class Road:
         :return: these and all lanes of the same direction beside them
         """
         return {each for lane in lanes for beside in (self.left, self.right) for each in self.row(lane, beside)}
+
+    def towards(self, lanes: Iterable[int]) -> Ints:
+        """
+        Tell how to get onto given lanes from those beside them.
+
+        :param lanes: indices of lanes
+        :return: for every lane the one to change to next, itself if there is none, shape ``(lanes,)``
+        """
+        beside = np.arange(len(self.length))
+        for lane in lanes:
+            for row in (self.row(lane, self.left), self.row(lane, self.right)):
+                beside[row[1:]] = row[:-1]
+        return beside
 
     @staticmethod
     def row(lane: int, beside: Ints) -> list[int]:

@@ -22,15 +22,13 @@ class Route:
         self.contains = np.zeros(len(road.length), dtype=bool)
         self._before = np.zeros(len(road.length))
         self._stretch = np.ones(len(road.length))
-        self.back = np.arange(len(road.length))
+        self.back = road.towards(lanes)
         """The lane to change to from each lane in order to get back to ``lanes``, the lane itself elsewhere."""
         metres = -start
         for lane in lanes:
             for each in road.with_lanes_beside([lane]):
                 self.contains[each] = True
                 self._before[each], self._stretch[each] = metres, road.length[lane] / road.length[each]
-            for row in (road.row(lane, road.left), road.row(lane, road.right)):
-                self.back[row[1:]] = row[:-1]
             metres += float(road.length[lane])
         self.length = metres - float(road.length[lanes[-1]]) + end
 

@@ -1,6 +1,7 @@
 """The frame that all driving scenarios share: spaces, time, physics, costs, rewards and the episode's record."""
 
 import math
+from copy import deepcopy
 from typing import Any
 
 import gymnasium
@@ -8,10 +9,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_esad.envs.config import check_config, merge_config
+from sb3_esad.envs.config import COMMON, check_config, merge_config
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
-from sb3_esad.envs.lanes import CAR_LENGTH
 from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
 from sb3_esad.envs.rewards import DrivingReward
@@ -19,7 +19,7 @@ from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
-from sb3_esad.envs.users import CAR_WIDTH, Kind
+from sb3_esad.envs.users import Kind
 from sb3_esad.envs.vehicle import Controls
 
 
@@ -32,14 +32,11 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     ``cost_terms``, ``rewards`` (the terms by name), ``speed`` and ``crashed``; at an episode's end also ``is_success`` and
     ``driving``, the record of :class:`Episode`.
 
-    ``has_lanes`` tells whether there are lanes to keep to.
-
     :param config: overrides of :meth:`default_config`
     :param observation: ``"image"``, ``"vector"`` or ``"dict"``
     :param render_mode: ``"rgb_array"``, ``"human"`` or None
     """
 
-    has_lanes = True
     metadata = {"render_modes": ["rgb_array", "human"], "render_fps": 5}  # noqa: RUF012 - typed by gymnasium
     road: Road
     route: Route
@@ -70,30 +67,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
 
         :return: a new dictionary; subclasses update ``super()``'s
         """
-        return {
-            "duration": 40.0,
-            "policy_frequency": 5,
-            "physics_frequency": 10,
-            "target_speed": 25.0,
-            "max_speed": 30.0,
-            "max_acceleration": 3.0,
-            "max_braking": 6.0,
-            "max_wheel_angle": 0.5,
-            "max_lateral_acceleration": 4.0,
-            "vehicle_size": (CAR_LENGTH, CAR_WIDTH),
-            "reward_weights": {"velocity": 0.7, "lane": 0.2, "orientation": 0.1, "exploration": 0.0},
-            "velocity_sharpness": 0.2,
-            "orientation_sharpness": 5.0,
-            "lane_tolerance": 2.0,
-            "exploration_decay": 0.1,
-            "graded_cost": False,
-            "graded_cost_ttc": 1.5,
-            "image_shape": (64, 64),
-            "metres_per_pixel": (1.25, 0.4),
-            "ahead": 0.775,
-            "frame": "lane",
-            "neighbours": 8,
-        }
+        return deepcopy(COMMON)
 
     def _make_road(self) -> Road:
         """Build the road; drawn anew at every reset."""
@@ -283,3 +257,17 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         if self._window is not None:
             self._window.close()
             self._window = None
+
+
+def scenario_of(env: gymnasium.Env[Any, Any]) -> Scenario:
+    """
+    The scenario inside its wrappers.
+
+    :param env: a scenario, wrapped or not
+    :return: the scenario
+    :raises TypeError: if it is none
+    """
+    scenario = env.unwrapped
+    if not isinstance(scenario, Scenario):
+        raise TypeError(f"{scenario} is no driving scenario; scripted drivers need one of sb3_esad.envs")
+    return scenario

@@ -16,6 +16,7 @@ MAX_WHEEL_ANGLE, MAX_APPROACH_ANGLE = np.pi / 3, np.pi / 4  # [rad]
 MAX_ACCELERATION = 6.0  # [m/s^2]
 EASY_BRAKING = 2.0  # cars slow down like this for lanes with a lower limit [m/s^2]
 STOP_GAP, STOP_HEADWAY = CAR_LENGTH / 2 + 1.0, 0.3  # centre to line [m], [s]
+GET_BACK = 100.0  # from here on to the end of a lane it is time to be on the lane of one's path [m]
 PURSUIT = 0.1  # cars take the direction that their lane will have after this time [s]
 
 
@@ -179,20 +180,38 @@ class Traffic(RoadUsers):
         pondering = rows[~changing & (self.timer[rows] > self.temper["delay"][rows])]
         if pondering.size:
             self.timer[pondering] = 0.0
-            self._ponder(pondering)
+            due = self._should_be_on_path(pondering)
+            self._ponder(pondering[~due])
+            self._get_back(pondering[due])
         for row in rows[changing]:
             self._reconsider(int(row), before)
+
+    def _should_be_on_path(self, rows: Ints) -> Bools:
+        """Whether the lane that a car is on, or one beside it, is on its path and ends soon."""
+        lane = self.lane[rows]
+        left = self.road.length[lane] - self.along[lane, rows]
+        return self.has_path[rows] & (self._handicap[lane, rows] == 0) & (left < GET_BACK)
 
     def _ponder(self, rows: Ints) -> None:
         cars = np.concatenate([rows, rows])
         lanes = np.concatenate([self.road.left[self.lane[rows]], self.road.right[self.lane[rows]]])
-        along, across = self.along[lanes, cars], self.across[lanes, cars]
-        reachable = (np.abs(across) <= 2 * self.road.width[lanes]) & (along >= 0)
-        reachable &= along < self.road.length[lanes] + CAR_LENGTH
-        possible = (lanes != NO_LANE) & reachable & (np.abs(self.speed[cars]) >= 1.0)
+        possible = (lanes != NO_LANE) & self._can_change(cars, lanes)
         cars, lanes = cars[possible], lanes[possible]
         worth = self.change_is_worth_it(cars, lanes)
         self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
+
+    def _get_back(self, rows: Ints) -> None:
+        lanes = self.towards_path[rows, self.lane[rows]]
+        possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
+        rows, lanes = rows[possible], lanes[possible]
+        safe = self.change_is_safe(rows, lanes)
+        self.target_lane[rows[safe]] = lanes[safe]
+
+    def _can_change(self, rows: Ints, lanes: Ints) -> Bools:
+        along, across = self.along[lanes, rows], self.across[lanes, rows]
+        reachable = (np.abs(across) <= 2 * self.road.width[lanes]) & (along >= 0)
+        reachable &= along < self.road.length[lanes] + CAR_LENGTH
+        return np.asarray(reachable & (np.abs(self.speed[rows]) >= 1.0))
 
     def _reconsider(self, row: int, before: Ints) -> None:
         """Give up a lane change if someone ahead is changing into the same lane; cars decide in the order of their rows."""

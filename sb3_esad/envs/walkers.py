@@ -8,7 +8,9 @@ from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
 
 PERSON_SIZE = (0.6, 0.6)  # [m]
-BERTH = 0.6  # people keep this far away from the side of a car, centre to side [m]
+BERTH, BERTH_OF_STANDING = 0.6, 0.45  # people keep this far away from a car, and from one that stands, centre to side [m]
+STEP, STEP_NEAR_STANDING = 1.0, 0.3  # they look as far ahead [m]
+WARNING = 1.0  # nobody steps in front of a car that would be there within this time [s]
 
 
 class Walkers:
@@ -51,17 +53,25 @@ class Walkers:
         self._departure[arrived] = time + self._random.uniform(*self._pause, len(arrived))
         offset = self._ends[np.arange(len(rows)), self._goal] - traffic.position[rows]
         traffic.heading[rows] = np.arctan2(offset[:, 1], offset[:, 0])
-        free = ~self._would_touch_a_car(traffic, rows)
+        free = ~self._must_wait(traffic, rows)
         traffic.speed[rows] = np.where((time >= self._departure) & free, self._speed, 0.0)
 
     @staticmethod
-    def _would_touch_a_car(traffic: Traffic, rows: Ints) -> Bools:
-        """Nobody walks into the side of a car."""
+    def _must_wait(traffic: Traffic, rows: Ints) -> Bools:
+        """Nobody walks into a car, nor steps in front of one that drives; who is in front of one already walks on."""
         cars = np.flatnonzero(traffic.kind == Kind.VEHICLE)
-        heading = traffic.heading[rows]
-        soon = traffic.position[rows] + np.stack([np.cos(heading), np.sin(heading)], -1)
-        offset = soon[:, None] - traffic.position[cars]
-        cos, sin = traffic.direction[cars].T
-        along, across = offset[..., 0] * cos + offset[..., 1] * sin, offset[..., 1] * cos - offset[..., 0] * sin
-        length, width = traffic.size[cars].T / 2 + BERTH
-        return np.asarray(((np.abs(along) < length) & (np.abs(across) < width)).any(1))
+        stands, heading = traffic.speed[cars] < 0.1, traffic.heading[rows]
+        step = np.where(stands, STEP_NEAR_STANDING, STEP)[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
+        here = traffic.position[rows][:, None] - traffic.position[cars]
+        (along, across), (_, across_now) = _in_frame_of(traffic, cars, here + step), _in_frame_of(traffic, cars, here)
+        length, width = traffic.size[cars].T / 2 + np.where(stands, BERTH_OF_STANDING, BERTH)
+        touches = (np.abs(along) < length) & (np.abs(across) < width)
+        steps_in_front = (along > 0) & (along < length + WARNING * traffic.speed[cars])
+        steps_in_front &= (np.abs(across) < width) & (np.abs(across_now) >= width)
+        return np.asarray((touches | steps_in_front).any(1))
+
+
+def _in_frame_of(traffic: Traffic, cars: Ints, offset: Floats) -> tuple[Floats, Floats]:
+    """Places ahead of and to the right of cars, ``offset`` of shape ``(n, cars, 2)`` being their distance from these [m]."""
+    cos, sin = traffic.direction[cars].T
+    return offset[..., 0] * cos + offset[..., 1] * sin, offset[..., 1] * cos - offset[..., 0] * sin

@@ -12,8 +12,9 @@ from sb3_esad.envs.population import Population
 from sb3_esad.envs.right_of_way import RightOfWay
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
-from sb3_esad.envs.towns import Town, town
-from sb3_esad.envs.users import User
+from sb3_esad.envs.town_plan import Town
+from sb3_esad.envs.towns import town
+from sb3_esad.envs.users import Temper, User
 from sb3_esad.envs.walkers import Walkers
 
 CROSSING, KERB = 4.0, 2.0  # people cross this far before the line, from this far beside the road [m]
@@ -55,7 +56,7 @@ class TownDrive(NetworkDrive):
         """A place on one of the first streets: a lane, and the distance from its start [m]."""
         random = self.np_random
         street = self.town.streets[int(random.integers(streets))]
-        lane = street[int(random.integers(2))].lanes
+        lane = street[int(random.integers(len(street)))].lanes
         pieces = lane[int(random.integers(len(lane)))]
         piece = pieces[int(random.integers(len(pieces)))]
         return piece, float(random.uniform(0.1, 0.7) * self.road.length[piece])
@@ -143,9 +144,29 @@ class LitTown(TownDrive):
 
 
 class Town03(TownDrive):
-    """A wide junction, a roundabout and winding streets. See :class:`TownDrive`."""
+    """A wide junction, a roundabout, winding streets and a narrow stretch. See :class:`TownDrive`."""
 
     town_name = "town03"
+
+
+class Town04(TownDrive):
+    """A ring of motorway with ramps and curves. See :class:`TownDrive`."""
+
+    town_name = "town04"
+    ego_temper = Temper(headway=0.9, gap=8.0, imposed_braking=3.0)
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """See :meth:`Scenario.default_config`."""
+        return {
+            **super().default_config(),
+            "route_length": 600.0,
+            "target_speed": 20.0,
+            "max_speed": 25.0,
+            "start_speed": (15.0, 19.0),
+            "cars": 70,
+            "desired_speed": (10.0, 21.0),
+        }
 
 
 class Town06(TownDrive):
