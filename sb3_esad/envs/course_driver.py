@@ -14,7 +14,7 @@ from sb3_esad.envs.scenario import Scenario, scenario_of
 from sb3_esad.envs.users import Kind
 
 CELL, INFLATION = 0.25, 0.75  # of the grid on which the way to the goal is searched, and of what is in the way there [m]
-STEP, STEPS = 0.2, 14  # of the arcs [s]
+STEP, STEPS = 0.1, 28  # of the arcs [s]
 WHEELS, SPEEDS = np.linspace(-1.0, 1.0, 17), np.array([0.0, 0.5, 1.0, 1.5, 2.0])  # [full lock], [m/s]
 CONTACT, COMFORT = 0.12, 0.6  # room to others that an arc must leave, and that it had better leave [m]
 
@@ -39,13 +39,14 @@ class CourseDriver:
         wheels, targets = (each.ravel() for each in np.meshgrid(WHEELS, SPEEDS))
         places, headings = self._arcs(scenario, wheels, targets)
         room = clearance(scenario, places, headings)
-        harmless = room.min(1) > CONTACT
+        here = clearance(scenario, traffic.position[None, :1], traffic.heading[None, :1]).item()
+        harmless = room.min(1) > min(CONTACT, here - 1e-6)  # who is nearer to something already must not get even nearer
         left = self._field.at(places[:, -1]) + 0.3 * np.abs(wrap_angle(headings[:, -1] - traffic.heading[EGO]))
         worth = left + 2.0 * np.maximum(COMFORT - room.min(1), 0.0) - 0.2 * targets
         best = int(np.where(harmless, worth, np.inf).argmin())
         target = targets[best] if harmless[best] else 0.0
         wheel_angle = wheels[best] * scenario.controls.full_lock(speed)
-        return scenario.controls.encode((target - speed) / STEP, wheel_angle, speed)
+        return scenario.controls.encode((target - speed) * scenario.config["policy_frequency"], wheel_angle, speed)
 
     @staticmethod
     def _arcs(scenario: Scenario, wheels: Floats, targets: Floats) -> tuple[Floats, Floats]:

@@ -9,6 +9,8 @@ from sb3_esad.envs.networks import Way
 from sb3_esad.envs.roads import Bools, Road
 
 GREEN, ALL_RED = 8.0, 3.0  # for one direction, and for all of them after it [s]
+AMBER = 2.0  # who cannot stop any more may pass a light that has been red for no longer than this [s]
+SETBACK = 7.0  # one stops so far before the junction, for people cross in between [m]
 LINE_DEPTH = 1.0  # of the line to stop at, along the lane [m]
 
 
@@ -27,7 +29,7 @@ class TrafficLights:
         self._across = np.abs(np.sin(heading)) > np.abs(np.cos(heading))
         self._ahead = offsets[np.array([way.junction for way in ways]) - 1]
         lines, self._line_of = np.unique(self._source, return_inverse=True)
-        ends = np.array([road.end(lane) for lane in lines])
+        ends = np.array([road.position(lane, road.length[lane] - SETBACK) for lane in lines])
         size = np.tile([LINE_DEPTH, road.width[0]], (len(lines), 1))
         self._lines = box_corners(ends, heading[np.unique(self._line_of, return_index=True)[1]], size)
 
@@ -41,6 +43,15 @@ class TrafficLights:
         phase = (time + self._ahead) % (2 * (GREEN + ALL_RED))
         green = np.where(self._across, (phase >= GREEN + ALL_RED) & (phase < 2 * GREEN + ALL_RED), phase < GREEN)
         return ~green
+
+    def forbidden(self, time: float) -> Bools:
+        """
+        Tell which ways nobody may enter any more, not even those who could not stop.
+
+        :param time: since the start [s]
+        :return: one truth value per way
+        """
+        return self.red(time) & self.red(time - AMBER)
 
     def red_lines(self, time: float) -> Floats:
         """

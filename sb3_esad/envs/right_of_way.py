@@ -11,7 +11,8 @@ from sb3_esad.envs.roads import Bools, Road
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 
-ZONE = 25.0  # from here on one queues up [m]
+ZONE = 25.0  # from here on one queues up, where there are no lights [m]
+HARD_BRAKING = 6.0  # a red light is for those who can still stop like this [m/s^2]
 APART = 3.0  # ways whose centre lines come nearer to each other than this cannot be driven at the same time [m]
 
 
@@ -38,18 +39,21 @@ class RightOfWay:
     All vehicles queue, the ego vehicle too, but what it does is its own affair.
 
     :param crossings: of the road
+    :param zone: how far before a junction one heeds it [m]
     """
 
-    def __init__(self, crossings: Crossings) -> None:
+    def __init__(self, crossings: Crossings, zone: float = ZONE) -> None:
+        self._zone = zone
         self._way_of, self._crosses = crossings.way_of, crossings.crosses
         self._queue: dict[int, int] = {}
 
-    def regulate(self, traffic: Traffic, red: Bools | None = None) -> None:
+    def regulate(self, traffic: Traffic, red: Bools | None = None, setback: float = 0.0) -> None:
         """
         Tell everybody where to stop.
 
         :param traffic: all road users; ``stop_distance`` is set
         :param red: whether each way has a red light; who waits there is in nobody's way
+        :param setback: how far before the junction one stops [m]
         """
         vehicles = np.flatnonzero(traffic.kind == Kind.VEHICLE).tolist()
         places = {row: place for row in vehicles if (place := self.way_ahead(traffic, row))}
@@ -62,10 +66,11 @@ class RightOfWay:
         traffic.stop_distance[:] = np.inf
         before: list[int] = []
         for row, way in self._queue.items():
-            outside = places[row][1] > 0
-            must_stop = outside and red is not None and red[way]
-            if must_stop or (outside and self._crosses[way, before].any()):
-                traffic.stop_distance[row] = places[row][1]
+            left = places[row][1] - setback
+            can_stop = left > float(traffic.speed[row]) ** 2 / (2 * HARD_BRAKING)
+            must_stop = can_stop and red is not None and red[way]
+            if must_stop or (left > 0 and self._crosses[way, before].any()):
+                traffic.stop_distance[row] = left
             if not must_stop:
                 before.append(way)
 
@@ -83,7 +88,7 @@ class RightOfWay:
             if self._way_of[lane] != NO_LANE:
                 return int(self._way_of[lane]), distance
             distance += float(traffic.road.length[lane])
-            if distance > ZONE:
+            if distance > self._zone:
                 return None
             lane = int(traffic.next_lane[row, lane])
             if lane == NO_LANE:

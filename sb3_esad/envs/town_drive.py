@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lanes import LANE_WIDTH
-from sb3_esad.envs.lights import ALL_RED, GREEN, TrafficLights
+from sb3_esad.envs.lights import ALL_RED, GREEN, SETBACK, TrafficLights
 from sb3_esad.envs.network_drive import NetworkDrive
 from sb3_esad.envs.population import Population
 from sb3_esad.envs.right_of_way import RightOfWay
@@ -17,6 +17,7 @@ from sb3_esad.envs.towns import town
 from sb3_esad.envs.users import Temper, User
 from sb3_esad.envs.walkers import Walkers
 
+LIGHTS_SEEN = 40.0  # from as far before a junction [m]
 CROSSING, KERB = 4.0, 2.0  # people cross this far before the line, from this far beside the road [m]
 APART = 14.0  # nobody is placed nearer to someone else of the same lane than this [m]
 
@@ -106,6 +107,7 @@ class LitTown(TownDrive):
 
     def _make_road(self) -> Road:
         road = super()._make_road()
+        self.right_of_way = RightOfWay(self.town.crossings, LIGHTS_SEEN)
         junctions = max(way.junction for way in self.town.ways)
         self.lights = TrafficLights(road, self.town.ways, self.np_random.uniform(0.0, 2 * (GREEN + ALL_RED), junctions))
         return road
@@ -126,16 +128,15 @@ class LitTown(TownDrive):
         return sides[:: int(self.np_random.choice([-1, 1]))]
 
     def _before_physics(self) -> None:
-        self._red = self.lights.red(self.episode.time)
         self._way = self.right_of_way.way_ahead(self.traffic, EGO)
-        self.right_of_way.regulate(self.traffic, self._red)
+        self.right_of_way.regulate(self.traffic, self.lights.red(self.episode.time), SETBACK)
         self.walkers.walk(self.traffic, self.episode.time)
 
     def _ran_red_light(self) -> bool:
         ahead, now = self._way, self.right_of_way.way_ahead(self.traffic, EGO)
         if ahead is None or now is None or ahead[0] != now[0]:
             return False
-        return ahead[1] > 0 >= now[1] and bool(self._red[now[0]])
+        return ahead[1] > SETBACK >= now[1] and bool(self.lights.forbidden(self.episode.time)[now[0]])
 
     @property
     def red_lines(self) -> Floats:

@@ -9,7 +9,8 @@ from sb3_esad.envs.users import Kind, User
 
 PERSON_SIZE = (0.6, 0.6)  # [m]
 BERTH, BERTH_OF_STANDING = 0.6, 0.45  # people keep this far away from a car, and from one that stands, centre to side [m]
-STEP, STEP_NEAR_STANDING = 1.0, 0.3  # they look as far ahead [m]
+LOOK, LOOK_NEAR_STANDING = 1.0, 0.25  # they look as far ahead [m], and past a car that stands [s]
+PATIENCE = 1.5  # who cannot go on for so long turns round [s]
 WARNING = 1.0  # nobody steps in front of a car that would be there within this time [s]
 
 
@@ -30,6 +31,7 @@ class Walkers:
         self._pause = pause
         self._goal = np.zeros(len(ends), dtype=np.int64)
         self._departure = random.uniform(0.0, pause[1], len(ends))
+        self._held_up_since = np.full(len(ends), np.inf)
 
     def people(self) -> list[User]:
         """
@@ -53,15 +55,17 @@ class Walkers:
         self._departure[arrived] = time + self._random.uniform(*self._pause, len(arrived))
         offset = self._ends[np.arange(len(rows)), self._goal] - traffic.position[rows]
         traffic.heading[rows] = np.arctan2(offset[:, 1], offset[:, 0])
-        free = ~self._must_wait(traffic, rows)
-        traffic.speed[rows] = np.where((time >= self._departure) & free, self._speed, 0.0)
+        walks, held_up = time >= self._departure, self._must_wait(traffic, rows)
+        traffic.speed[rows] = np.where(walks & ~held_up, self._speed, 0.0)
+        self._held_up_since = np.where(walks & held_up, np.minimum(self._held_up_since, time), np.inf)
+        turning = time - self._held_up_since >= PATIENCE
+        self._goal[turning] = 1 - self._goal[turning]
 
-    @staticmethod
-    def _must_wait(traffic: Traffic, rows: Ints) -> Bools:
+    def _must_wait(self, traffic: Traffic, rows: Ints) -> Bools:
         """Nobody walks into a car, nor steps in front of one that drives; who is in front of one already walks on."""
         cars = np.flatnonzero(traffic.kind == Kind.VEHICLE)
         stands, heading = traffic.speed[cars] < 0.1, traffic.heading[rows]
-        step = np.where(stands, STEP_NEAR_STANDING, STEP)[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
+        step = np.where(stands, LOOK_NEAR_STANDING * self._speed, LOOK)[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
         here = traffic.position[rows][:, None] - traffic.position[cars]
         (along, across), (_, across_now) = _in_frame_of(traffic, cars, here + step), _in_frame_of(traffic, cars, here)
         length, width = traffic.size[cars].T / 2 + np.where(stands, BERTH_OF_STANDING, BERTH)
