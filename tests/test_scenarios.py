@@ -45,8 +45,22 @@ SCENARIOS: dict[str, type[Scenario]] = {
     "course-2mps": Course2,
     "course-3mps": Course3,
 }
-SOLVED = {"highway": 20.5, "traffic-negotiation": 5.0, "obstacle-avoidance": 8.0, "braking": 18.0}
-"""Least mean speed of the reference driver in the scenarios that are finished [m/s]."""
+SOLVED = {
+    "highway": (30, 20.5),
+    "traffic-negotiation": (30, 5.0),
+    "obstacle-avoidance": (30, 8.0),
+    "braking": (30, 18.0),
+    "town03": (12, 8.0),
+    "town04": (12, 13.0),
+    "town06": (12, 9.5),
+    "town07": (12, 7.5),
+    "town10": (12, 4.0),
+    "course": (12, 1.9),
+    "course-1mps": (12, 1.8),
+    "course-2mps": (12, 1.7),
+    "course-3mps": (12, 1.7),
+}
+"""Episodes that are driven, and the least mean speed of the reference driver [m/s]."""
 IDS = [f"esad-{name}{suffix}-v0" for name in SCENARIOS for suffix in ("", "-vector", "-dict")]
 
 
@@ -107,8 +121,9 @@ def test_every_setting_is_checked() -> None:
 
 @pytest.mark.parametrize("name", SOLVED)
 def test_it_can_be_solved_and_is_not_trivial(name: str) -> None:
-    """Thirty of the hundred seeds of the table in the README."""
-    env_id, seeds = f"esad-{name}-vector-v0", range(30)
+    """Some of the hundred seeds of the table in the README."""
+    (episodes, least_speed), env_id = SOLVED[name], f"esad-{name}-vector-v0"
+    seeds = range(episodes)
     reference, keeper, chance = (
         summarise(evaluate_driver(driver, env_id, seeds)) for driver in ("reference", "keeper", "random")
     )
@@ -116,7 +131,7 @@ def test_it_can_be_solved_and_is_not_trivial(name: str) -> None:
     assert reference["collision_free"] >= 0.97
     assert keeper["DS"] <= reference["DS"] - 25
     assert chance["DS"] < 25
-    assert reference["speed"] > SOLVED[name]
+    assert reference["speed"] > least_speed
 
 
 def test_on_the_highway_following_is_enough_and_quick() -> None:
@@ -229,12 +244,6 @@ def test_every_registered_scenario_is_tested() -> None:
     assert {spec for spec in gymnasium.registry if spec.startswith("esad-")} == set(IDS)
 
 
-@pytest.mark.parametrize("name", ["town03", "town07", "course"])
-def test_the_reference_driver_finds_its_way(name: str) -> None:
-    reference = summarise(evaluate_driver("reference", f"esad-{name}-vector-v0", range(5)))
-    assert reference["DS"] >= 95
-
-
 @pytest.mark.parametrize("name", PLANS)
 def test_lanes_of_a_town_lead_on_where_they_end(name: str) -> None:
     road, _, ways, _ = town(name)
@@ -249,7 +258,9 @@ def test_lanes_of_a_town_lead_on_where_they_end(name: str) -> None:
     assert leads_on == set(range(len(road.length))), "nobody drives out of the town"
 
 
-@pytest.mark.parametrize("name", ["traffic-negotiation", "obstacle-avoidance", "braking"])
+@pytest.mark.parametrize(
+    "name", ["traffic-negotiation", "obstacle-avoidance", "braking", "town03", "town04", "town06", "town07"]
+)
 def test_the_others_do_not_collide(name: str) -> None:
     env, follow = make(f"esad-{name}-vector-v0"), CarFollower()
     for seed in range(8):

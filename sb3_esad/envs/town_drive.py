@@ -178,13 +178,19 @@ class Town06(TownDrive):
     @classmethod
     def default_config(cls) -> dict[str, Any]:
         """See :meth:`Scenario.default_config`."""
-        return {**super().default_config(), "target_speed": 14.0, "max_speed": 18.0, "cars": 45, "desired_speed": (9.0, 14.0)}
+        speeds = {"target_speed": 14.0, "max_speed": 18.0, "start_speed": (11.0, 14.0), "desired_speed": (7.0, 14.0)}
+        return {**super().default_config(), **speeds, "cars": 90}
 
 
 class Town07(TownDrive):
     """Winding two-way roads around a lake. See :class:`TownDrive`."""
 
     town_name = "town07"
+
+    @classmethod
+    def default_config(cls) -> dict[str, Any]:
+        """See :meth:`Scenario.default_config`."""
+        return {**super().default_config(), "cars": 60, "desired_speed": (4.0, 10.0)}
 
 
 class Town10(LitTown):

@@ -65,7 +65,10 @@ class Walkers:
         """Nobody walks into a car, nor steps in front of one that drives; who is in front of one already walks on."""
         cars = np.flatnonzero(traffic.kind == Kind.VEHICLE)
         stands, heading = traffic.speed[cars] < 0.1, traffic.heading[rows]
-        step = np.where(stands, LOOK_NEAR_STANDING * self._speed, LOOK)[:, None] * np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
+        step = (
+            np.where(stands, LOOK_NEAR_STANDING * self._speed, LOOK)[:, None]
+            * np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
+        )
         here = traffic.position[rows][:, None] - traffic.position[cars]
         (along, across), (_, across_now) = _in_frame_of(traffic, cars, here + step), _in_frame_of(traffic, cars, here)
         length, width = traffic.size[cars].T / 2 + np.where(stands, BERTH_OF_STANDING, BERTH)
