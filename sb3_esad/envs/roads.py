@@ -64,6 +64,8 @@ class Road:
         self.left = np.array([lane.left for lane in lanes])
         self.right = np.array([lane.right for lane in lanes])
         self.following = np.array([lane.following for lane in lanes])
+        self.continues = np.isin(np.arange(len(lanes)), self.following)
+        """Whether each lane continues another one."""
         self.row_of = np.array([self.row(lane, self.left)[-1] for lane in range(len(lanes))])
         """Lanes that one may change between have the same number here, that of the leftmost of them."""
         self._describe_arcs()

@@ -16,6 +16,7 @@ MAX_WHEEL_ANGLE, MAX_APPROACH_ANGLE = np.pi / 3, np.pi / 4  # [rad]
 MAX_ACCELERATION = 6.0  # [m/s^2]
 EASY_BRAKING = 2.0  # cars slow down like this for lanes with a lower limit [m/s^2]
 STOP_GAP, STOP_HEADWAY = CAR_LENGTH / 2 + 1.0, 0.3  # centre to line [m], [s]
+BLIND_BEHIND = 25.0  # nobody changes to a lane this near to its start, where who follows from the lane before is not seen [m]
 GET_BACK = 100.0  # from here on to the end of a lane it is time to be on the lane of one's path [m]
 PURSUIT = 0.1  # cars take the direction that their lane will have after this time [s]
 
@@ -211,6 +212,7 @@ class Traffic(RoadUsers):
         along, across = self.along[lanes, rows], self.across[lanes, rows]
         reachable = (np.abs(across) <= 2 * self.road.width[lanes]) & (along >= 0)
         reachable &= along < self.road.length[lanes] + CAR_LENGTH
+        reachable &= (along >= BLIND_BEHIND) | ~self.road.continues[lanes]
         return np.asarray(reachable & (np.abs(self.speed[rows]) >= 1.0))
 
     def _reconsider(self, row: int, before: Ints) -> None:
