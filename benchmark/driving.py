@@ -67,14 +67,15 @@ class CostInReward(gym.Wrapper[Any, Any, Any, Any]):
 
 def sac(seed: int, changes: dict[str, Any]) -> SAC:
     """
-    Build SB3's SAC for images that show speeds in one frame.
+    Build SB3's SAC for images that show speeds in one frame; settings by docs/experiments.md, section 14.
 
     :param seed: of the training
     :param changes: arguments of the constructor to replace, and ``penalty``, what a cost takes from the reward
     :return: the algorithm
     """
-    penalty = changes.pop("penalty", 0.0)
-    arguments: dict[str, Any] = {"buffer_size": 50_000, "batch_size": 128, "gamma": 0.97, "learning_starts": 1000, **changes}
+    penalty = changes.pop("penalty", 10.0)
+    tuned = {"batch_size": 64, "learning_rate": 1e-3, "ent_coef": "auto_0.1", "target_entropy": -1.0}
+    arguments: dict[str, Any] = {"buffer_size": 50_000, "gamma": 0.97, "learning_starts": 1000, **tuned, **changes}
     return SAC("CnnPolicy", make_vec_env(ENV, wrapper_class=partial(CostInReward, penalty=penalty)), seed=seed, **arguments)
 
 

@@ -1,4 +1,4 @@
-"""Steps per second of esad-highway-v0 beside stock highway-env: ``python benchmark/scenario_speed.py``."""
+"""Steps per second of the scenarios, images included, beside stock highway-env: ``python benchmark/scenario_speed.py``."""
 
 import argparse
 import time
@@ -9,6 +9,10 @@ import numpy as np
 
 import sb3_esad.envs  # noqa: F401  (registers ours)
 from sb3_esad.envs.scenario import scenario_of
+
+SITUATIONS = ("highway", "traffic-negotiation", "obstacle-avoidance", "braking")
+TOWNS = ("town03", "town04", "town06", "town07", "town10")
+ROADS = [f"esad-{name}-v0" for name in (*SITUATIONS, *TOWNS)]
 
 
 def stock(vehicles: int) -> gym.Env:
@@ -48,25 +52,39 @@ def rate(env: gym.Env, steps: int) -> float:
     return steps / (time.perf_counter() - begin)
 
 
-def main() -> None:
-    """Alternate both, print medians and their ratio."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=5)
-    parser.add_argument("--steps", type=int, default=300)
-    args = parser.parse_args()
-    ours = gym.make("esad-highway-v0")
+def compare(env_id: str, repeats: int, steps: int) -> None:
+    """
+    Alternate a scenario and the stock environment with as many vehicles, print medians and their ratio.
+
+    :param env_id: scenario
+    :param repeats: how often
+    :param steps: each time
+    """
+    ours = gym.make(env_id)
     ours.reset(seed=0)
     vehicles = len(scenario_of(ours).traffic.speed) - 1
-    envs = {"esad-highway-v0": ours, "highway-fast-v0": stock(vehicles)}
-    rates: dict[str, list[float]] = {name: [] for name in envs}
-    for _ in range(args.repeats):
-        for name, env in envs.items():
-            rates[name].append(rate(env, args.steps))
-    for name, values in rates.items():
-        print(f"{name:16s} median {np.median(values):.0f} steps/s, from {min(values):.0f} to {max(values):.0f}")
+    rivals: tuple[gym.Env, gym.Env] = (ours, stock(vehicles))
+    rates: tuple[list[float], list[float]] = ([], [])
+    for _ in range(repeats):
+        for env, values in zip(rivals, rates, strict=True):
+            values.append(rate(env, steps))
+    own, other = np.median(rates[0]), np.median(rates[1])
+    spread = f"from {min(rates[0]):.0f} to {max(rates[0]):.0f}"
     print(
-        f"ratio {np.median(rates['esad-highway-v0']) / np.median(rates['highway-fast-v0']):.1f} ({vehicles} vehicles, images)"
+        f"{env_id:30s} {own:5.0f} steps/s ({spread}), stock {other:4.0f}, ratio {own / other:4.1f}, {vehicles} others",
+        flush=True,
     )
+
+
+def main() -> None:
+    """Compare every scenario that has roads."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--steps", type=int, default=200)
+    parser.add_argument("--envs", nargs="+", default=ROADS)
+    args = parser.parse_args()
+    for env_id in args.envs:
+        compare(env_id, args.repeats, args.steps)
 
 
 if __name__ == "__main__":
