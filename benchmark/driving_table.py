@@ -11,7 +11,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from sb3_esad.envs.metrics import poisson_interval
+from sb3_esad.envs.intervals import poisson_interval
 
 Line = dict[str, Any]
 MODES = ("best", "sampled")

@@ -12,7 +12,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
 from sb3_esad.common.costs import CostReader
 from sb3_esad.envs.drivers import DRIVERS
-from sb3_esad.envs.metrics import Record
+from sb3_esad.envs.episode import Record
 from sb3_esad.envs.scenario import Scenario
 
 

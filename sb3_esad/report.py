@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from sb3_esad.common.save_util import whole_file
-from sb3_esad.envs.metrics import Record, mean_interval, summarise
+from sb3_esad.envs.episode import Record
+from sb3_esad.envs.intervals import mean_interval
+from sb3_esad.envs.metrics import summarise
 
 Figures = dict[str, float]
 
@@ -41,6 +43,10 @@ ROWS = (
     Row("TTC", "smallest time to collision TTC [s] ↑", 2),
     Row("TTC_5", "TTC, 5th percentile [s] ↑", 2),
     Row("speed", "mean speed [m/s] ↑", 1),
+    Row("path", "length of the path [m]", 1),
+    Row("curvature", "largest curvature of the path [1/m] ↓", 3),
+    Row("duration", "time taken [s]", 1),
+    Row("safety", "safety: free of collisions x share of the path with 0.5 m of room [%] ↑", 1),
     Row("return", "return ↑", 1),
     Row("cost", "cost per episode ↓", 3),
     Row("cost_cvar", "cost, worst tenth of the episodes ↓", 2),

@@ -6,19 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 
-from sb3_esad.envs.hazards import time_to_collision
+from sb3_esad.envs.course import hall
+from sb3_esad.envs.episode import LONGEST_TTC, Episode
+from sb3_esad.envs.hazards import clearance, time_to_collision
 from sb3_esad.envs.highway import highway_road
-from sb3_esad.envs.metrics import (
-    LONGEST_TTC,
-    DrivingMetrics,
-    Episode,
-    bootstrap_interval,
-    mean_interval,
-    poisson_interval,
-    summarise,
-    wilson_interval,
-    worst_mean,
-)
+from sb3_esad.envs.intervals import bootstrap_interval, mean_interval, poisson_interval, wilson_interval, worst_mean
+from sb3_esad.envs.metrics import DrivingMetrics, summarise
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
 
@@ -208,3 +201,34 @@ def test_resampled_interval_holds_the_truth_of_a_tail() -> None:
     random = np.random.default_rng(4)
     intervals = [bootstrap_interval(random.exponential(size=200), worst_mean) for _ in range(60)]
     assert 0.85 <= np.mean([low < 1 + math.log(10) < high for low, high in intervals]) <= 1.0
+
+
+def test_the_course_s_figures_by_hand() -> None:
+    """Two episodes of 4 and 6 m, one of which hits something; half of the first path and two thirds of the other have room."""
+    free, hit = Episode(10.0), Episode(10.0)
+    for room, turned in ((0.6, 0.1), (0.5, -0.4)):
+        free.add_motion(1.0, 2.0, 2.0, on_route=True)
+        free.add_path(2.0, turned, room)
+    for room in (5.0, 0.4, 0.8):
+        hit.add_motion(1.0, 2.0, 2.0, on_route=True)
+        hit.add_path(2.0, 0.0, room)
+    hit.add_path(0.001, 1.0, 0.0)  # hardly a step: no curvature
+    hit.add_infraction("static")
+    first, second = free.record(True), hit.record(False)
+    assert (first["clear_distance"], second["clear_distance"]) == (2.0, 4.0)
+    assert (first["max_curvature"], second["max_curvature"]) == (pytest.approx(0.2), 0.0)
+    figures = summarise([first, second])
+    assert figures["safety"] == pytest.approx(100 * 0.5 * 6.0 / 10.0)
+    assert 0.0 <= figures["safety_low"] <= figures["safety"] <= figures["safety_high"] <= 100.0
+    assert (figures["path"], figures["curvature"], figures["duration"]) == (5.0, pytest.approx(0.1), 2.5)
+
+
+def test_room_to_what_is_nearest() -> None:
+    """In a hall 12 m wide a vehicle of 1.2 x 0.8 m has 5.6 m to either wall, capped at 5, and 1.3 m to a box ahead."""
+    road = hall(40.0, 12.0)
+    ego = User((10.0, 0.0), drives=False, size=(1.2, 0.8))
+    box = User((12.4, 0.0), kind=Kind.STATIC, drives=False, size=(1.0, 1.0))
+    assert clearance(road, Traffic(road, [ego])) == pytest.approx(5.0)
+    assert clearance(road, Traffic(road, [ego, box])) == pytest.approx(1.3)
+    beside = User((10.0, 4.8), drives=False, size=(1.2, 0.8))
+    assert clearance(road, Traffic(road, [beside, box])) == pytest.approx(0.8)

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 
 from sb3_esad.envs.geometry import Floats
+from sb3_esad.envs.hazards import clearance
 from sb3_esad.envs.lanes import Lane
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Markings, Road
@@ -117,6 +118,9 @@ class Course(Scenario):
 
     def _before_physics(self) -> None:
         self.walkers.walk(self.traffic, self.episode.time)
+
+    def _clearance(self) -> float:
+        return clearance(self.road, self.traffic)
 
     def _progress(self) -> float:
         return float(self.traffic.position[EGO, 0])

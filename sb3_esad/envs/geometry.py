@@ -51,3 +51,24 @@ def boxes_overlap(box: Floats, others: Floats) -> NDArray[np.bool_]:
     second = np.einsum("nad,ncd->nac", axes, others)
     gaps = (first.min(-1) > second.max(-1)) | (second.min(-1) > first.max(-1))
     return np.asarray(~gaps.any(-1))
+
+
+def box_distances(box: Floats, others: Floats) -> Floats:
+    """
+    Room between one rectangle and each of several.
+
+    :param box: corners of one rectangle in order, shape ``(4, 2)`` [m]
+    :param others: corners of the others, shape ``(n, 4, 2)`` [m]
+    :return: smallest distance to each of the others, 0 where they overlap, shape ``(n,)`` [m]
+    """
+    own = np.broadcast_to(box, others.shape)
+    nearest = np.minimum(_corners_to_sides(own, others), _corners_to_sides(others, own))
+    return np.where(boxes_overlap(box, others), 0.0, nearest)
+
+
+def _corners_to_sides(corners: Floats, shapes: Floats) -> Floats:
+    """Smallest distance from the corners of each first rectangle to the sides of each second one, shape ``(n,)`` [m]."""
+    start, side = shapes[:, None], np.roll(shapes, -1, axis=1)[:, None] - shapes[:, None]
+    offset = corners[:, :, None] - start
+    share = np.clip((offset * side).sum(-1) / (side**2).sum(-1), 0.0, 1.0)
+    return np.asarray(np.linalg.norm(offset - share[..., None] * side, axis=-1).min((1, 2)))

@@ -2,10 +2,12 @@
 
 import numpy as np
 
-from sb3_esad.envs.geometry import box_corners, boxes_overlap
+from sb3_esad.envs.geometry import box_corners, box_distances, boxes_overlap
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Ints, Road
 from sb3_esad.envs.traffic import Traffic
+
+NEARBY = 5.0  # room beyond this need not be known [m]
 
 
 def users_hit(traffic: Traffic) -> Ints:
@@ -35,6 +37,27 @@ def is_off_road(road: Road, traffic: Traffic) -> bool:
     own = slice(EGO, EGO + 1)
     corners = box_corners(traffic.position[own], traffic.heading[own], traffic.size[own])[0]
     return not bool(road.contains(corners).all())
+
+
+def clearance(road: Road, traffic: Traffic) -> float:
+    """
+    Room between the ego vehicle and what is nearest: another road user, or the edge of the lanes it may use.
+
+    :param road: the lanes
+    :param traffic: all road users
+    :return: at most 5 m, negative past the edge [m]
+    """
+    corners = box_corners(traffic.position[:1], traffic.heading[:1], traffic.size[:1])[0]
+    lane = int(traffic.lane[EGO])
+    _, across = road.project(corners)
+    room = min(NEARBY, *(side for corner in across.T for side in road.room(lane, corner)))
+    reach = traffic.radius + traffic.radius[EGO] + NEARBY
+    offset = np.abs(traffic.position - traffic.position[EGO])
+    rows = np.flatnonzero((offset < reach[:, None]).all(1))[1:]
+    if rows.size == 0:
+        return room
+    others = box_corners(traffic.position[rows], traffic.heading[rows], traffic.size[rows])
+    return min(room, float(box_distances(corners, others).min()))
 
 
 def time_to_collision(traffic: Traffic) -> float:

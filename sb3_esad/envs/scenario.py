@@ -10,9 +10,9 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from sb3_esad.envs.config import COMMON, check_config, merge_config
+from sb3_esad.envs.episode import Episode
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
-from sb3_esad.envs.metrics import Episode
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
 from sb3_esad.envs.rewards import DrivingReward
 from sb3_esad.envs.road_users import EGO
@@ -87,6 +87,10 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     def _progress(self) -> float:
         """Position of the ego vehicle along the route [m]."""
         raise NotImplementedError
+
+    def _clearance(self) -> float:
+        """Room to what is nearest, infinite where closeness is no matter of safety [m]."""
+        return math.inf
 
     def _ran_red_light(self) -> bool:
         """Whether the ego vehicle crossed a red light's stop line in this step."""
@@ -188,7 +192,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return {"is_success": success, "driving": self.episode.record(success)}
 
     def _drive(self, action: NDArray[np.floating]) -> None:
-        traffic, frequency = self.traffic, self.config["physics_frequency"]
+        traffic, frequency, heading = self.traffic, self.config["physics_frequency"], float(self.traffic.heading[EGO])
         dt, metres, duration = 1.0 / frequency, 0.0, 0.0
         self._before_physics()
         for _ in range(frequency // self.config["policy_frequency"]):
@@ -203,6 +207,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
                 break
         on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self._wrong_way()
         self.episode.add_motion(duration, metres, self._progress(), on_route)
+        self.episode.add_path(metres, float(traffic.heading[EGO]) - heading, self._clearance())
 
     def _check_crash(self) -> None:
         hit = users_hit(self.traffic)
