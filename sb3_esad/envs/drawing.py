@@ -15,7 +15,7 @@ from sb3_esad.envs.users import Kind
 Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-PICTURE = View((960, 320), (1 / 8, 1 / 8), 0.75)
+SIZE, AHEAD, ZOOM = (960, 320), 0.75, 10.0  # [px], share of what is seen, and pixels for each of those of the agent's image
 GRASS, ASPHALT, ROUTE, PAINT = (44, 62, 48), (70, 70, 74), (92, 92, 98), (225, 225, 225)
 EGO_COLOUR, CRASH_COLOUR, STATIC_COLOUR, PERSON_COLOUR = (64, 220, 110), (235, 60, 50), (240, 150, 40), (240, 90, 200)
 RED = (220, 40, 40)
@@ -31,18 +31,20 @@ def draw_scene(scenario: Scenario) -> Image:
     :return: RGB picture, shape ``(320, 960, 3)``
     """
     traffic, markings = scenario.traffic, scenario.road.markings
+    scale = scenario.config["metres_per_pixel"][0] / ZOOM
+    view = View(SIZE, (scale, scale), AHEAD)
     origin, heading = traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error
-    canvas = np.empty((*PICTURE.shape, 3), dtype=np.uint8)
+    canvas = np.empty((*SIZE, 3), dtype=np.uint8)
     canvas[:] = GRASS
     surfaces, on_route = markings.with_route_on_top(scenario.route.contains)
     asphalt = [ROUTE if on else ASPHALT for on in on_route]
-    PICTURE.fill([canvas] * len(asphalt), PICTURE.pixels(surfaces, origin, heading), asphalt)
-    lines = PICTURE.pixels(markings.lines, origin, heading)
-    PICTURE.lines(canvas, lines, [PAINT] * len(lines), 2)
-    red = PICTURE.pixels(scenario.red_lines, origin, heading)
-    PICTURE.fill([canvas] * len(red), red, [RED] * len(red))
-    boxes = PICTURE.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)
-    PICTURE.fill([canvas] * len(boxes), boxes, [_colour(scenario, row) for row in range(len(boxes))])
+    view.fill([canvas] * len(asphalt), view.pixels(surfaces, origin, heading), asphalt)
+    lines = view.pixels(markings.lines, origin, heading)
+    view.lines(canvas, lines, [PAINT] * len(lines), 2)
+    red = view.pixels(scenario.red_lines, origin, heading)
+    view.fill([canvas] * len(red), red, [RED] * len(red))
+    boxes = view.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)
+    view.fill([canvas] * len(boxes), boxes, [_colour(scenario, row) for row in range(len(boxes))])
     picture = np.ascontiguousarray(np.rot90(canvas, -1))
     _write(picture, scenario)
     return picture
@@ -60,16 +62,20 @@ def _colour(scenario: Scenario, row: int) -> Colour:
 
 
 def _write(picture: Image, scenario: Scenario) -> None:
-    episode = scenario.episode
+    episode, so_far = scenario.episode, scenario.episode.record(success=False)
     parts = (
         f"speed {scenario.traffic.speed[EGO]:4.1f} m/s",
         f"cost {episode.total_cost:.1f}",
         f"reward {episode.total_reward:.1f}",
         f"route {100 * (1 - scenario.remaining):.0f} %",
+        f"driving score {100 * so_far['driving_score']:.0f} %",
+        f"time to collision {so_far['min_ttc']:.1f} s",
         f"{episode.time:.1f} s",
     )
-    text = "    ".join(parts)
-    cv2.putText(picture, text, (12, 24), cv2.FONT_HERSHEY_SIMPLEX, 0.55, PAINT, 1, cv2.LINE_AA)
+    committed = ", ".join(f"{count} x {name.replace('_', ' ')}" for name, count in episode.infractions.items() if count)
+    for row, text in enumerate(("    ".join(parts), f"infractions: {committed or 'none'}")):
+        colour = CRASH_COLOUR if row and committed else PAINT
+        cv2.putText(picture, text, (12, 24 + 22 * row), cv2.FONT_HERSHEY_SIMPLEX, 0.55, colour, 1, cv2.LINE_AA)
 
 
 class Window:

@@ -61,9 +61,9 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
     ``DS``, ``RC``, ``IS`` (0 to 100), ``success`` and ``collision_free`` (shares), ``CO`` (collisions per 100 m), ``CR``
     (collisions per km), ``IPK`` (infractions per km), ``TTC`` and ``TTC_5`` (mean and 5th percentile of the episodes'
-    smallest time to collision, s), ``speed`` (m/s), ``path`` (its length, m), ``curvature`` (the largest, 1/m), ``duration`` (s),
-    ``return``, ``cost``, ``cost_cvar`` (mean cost of the worst tenth) and ``safety`` (0 to 100: the share of episodes without
-    collision times the share of the path with more than 0.5 m to what is nearest).
+    smallest time to collision, s), ``speed`` (m/s), ``path`` (its length, m), ``curvature`` (the largest, 1/m),
+    ``duration`` (s), ``return``, ``cost``, ``cost_cvar`` (mean cost of the worst tenth) and ``safety`` (0 to 100: the share of
+    episodes without collision times the share of the path with more than 0.5 m to what is nearest).
     ``<name>_low`` and ``<name>_high`` bound 95 % intervals: Wilson's for shares, Poisson's for events per distance,
     Student's t for means, resampling for the rest.
 
