@@ -1,8 +1,10 @@
 """What the ego vehicle has hit, and how soon it would hit what is in its path."""
 
+from typing import Protocol
+
 import numpy as np
 
-from sb3_esad.envs.geometry import box_corners, box_distances, boxes_overlap
+from sb3_esad.envs.geometry import Floats, box_corners, box_distances, boxes_overlap
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Ints, Road
 from sb3_esad.envs.traffic import Traffic
@@ -60,7 +62,31 @@ def clearance(road: Road, traffic: Traffic) -> float:
     return min(room, float(box_distances(corners, others).min()))
 
 
-def time_to_collision(traffic: Traffic) -> float:
+class Moving(Protocol):
+    """Road users as arrays, the ego vehicle first."""
+
+    @property
+    def position(self) -> Floats:
+        """Centres, shape ``(n, 2)`` [m]."""
+
+    @property
+    def direction(self) -> Floats:
+        """Unit vectors, shape ``(n, 2)``."""
+
+    @property
+    def speed(self) -> Floats:
+        """Shape ``(n,)`` [m/s]."""
+
+    @property
+    def velocity(self) -> Floats:
+        """Shape ``(n, 2)`` [m/s]."""
+
+    @property
+    def size(self) -> Floats:
+        """Length and width, shape ``(n, 2)`` [m]."""
+
+
+def time_to_collision(traffic: Moving) -> float:
     """
     Smallest distance over closing speed to any user in the ego vehicle's path, if both kept their velocities.
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs.episode import Record
 from sb3_esad.envs.intervals import bootstrap_interval, mean_interval, poisson_interval, wilson_interval, worst_mean
+from sb3_esad.envs.stock_record import StockRecord, is_stock
 
 Columns = Mapping[str, NDArray[np.floating]]
 Figure = tuple[str, float, tuple[float, float]]
@@ -30,13 +31,14 @@ MEANS = (
 
 class DrivingMetrics(gymnasium.Wrapper[Any, Any, Any, Any]):
     """
-    Keeps the records of all finished episodes of a driving scenario in ``records``.
+    Keeps the records of all finished episodes in ``records``.
 
-    :param env: an environment that puts its record into ``info["driving"]`` when an episode ends
+    :param env: a driving scenario, or another environment that puts its record into ``info["driving"]`` at an episode's end;
+        those of highway-env get a :class:`StockRecord`
     """
 
     def __init__(self, env: gymnasium.Env[Any, Any]) -> None:
-        super().__init__(env)
+        super().__init__(StockRecord(env) if is_stock(env) else env)
         self.records: list[Record] = []
 
     def step(self, action: Any) -> tuple[Any, SupportsFloat, bool, bool, dict[str, Any]]:
@@ -50,7 +52,9 @@ class DrivingMetrics(gymnasium.Wrapper[Any, Any, Any, Any]):
         observation, reward, terminated, truncated, info = self.env.step(action)
         if terminated or truncated:
             if "driving" not in info:
-                raise KeyError(f"{self.env} ended an episode without info['driving']; wrap a scenario of sb3_esad.envs")
+                raise KeyError(
+                    f"{self.env} ended an episode without info['driving']; wrap a scenario of sb3_esad.envs or of highway-env"
+                )
             self.records.append(info["driving"])
         return observation, reward, terminated, truncated, info
 
