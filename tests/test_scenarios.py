@@ -3,6 +3,7 @@
 import itertools
 import math
 import pickle
+from functools import partial
 from typing import Any
 
 import gymnasium
@@ -10,6 +11,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 from stable_baselines3.common.env_checker import check_env as check_sb3_env
+from stable_baselines3.common.vec_env import DummyVecEnv, SubprocVecEnv
 
 from sb3_esad.driving_evaluation import evaluate_driver
 from sb3_esad.envs.braking import Braking
@@ -110,6 +112,40 @@ def test_pickling_in_mid_episode(env_id: str) -> None:
     play(env, actions[:4])
     copy = pickle.loads(pickle.dumps(env))
     assert play(copy, actions[4:]) == play(env, actions[4:])
+
+
+def test_same_seed_same_episode_in_other_processes() -> None:
+    """All scenarios at once, each in a process of its own."""
+    makers = [partial(gymnasium.make, f"sb3_esad.envs:esad-{name}-vector-v0") for name in SCENARIOS]
+    here, there = DummyVecEnv(makers), SubprocVecEnv(makers)
+    for env in (here, there):
+        env.seed(3)
+    np.testing.assert_array_equal(here.reset(), there.reset())
+    for action in np.random.default_rng(0).uniform(-0.1, 0.1, (20, len(SCENARIOS), 2)).astype(np.float32):
+        for ours, theirs in zip(here.step(action)[:3], there.step(action)[:3], strict=True):
+            np.testing.assert_array_equal(ours, np.asarray(theirs, dtype=ours.dtype))
+    there.close()
+
+
+@pytest.mark.parametrize(
+    ("name", "config", "message"),
+    [
+        ("town03", {"spawn": "anywhere"}, "spawn is 'anywhere'; choose random or fixed"),
+        ("town10", {"cars": -1}, "cars is -1; choose a whole number from 0 on"),
+        ("course-2mps", {"walking_speed": -1.0}, "walking_speed is -1.0; choose a number above 0"),
+        ("course", {"obstacles": (9, 3)}, r"obstacles is \(9, 3\); choose two numbers from 0 on, the smaller one first"),
+        ("highway", {"start_speed": (-3.0, 2.0)}, "start_speed is .* choose two numbers from 0 on"),
+        ("town04", {"route_lenght": 100.0}, "unknown configuration key 'route_lenght'; did you mean 'route_length'"),
+    ],
+)
+def test_settings_that_make_no_sense(name: str, config: dict[str, Any], message: str) -> None:
+    with pytest.raises(ValueError, match=message):
+        gymnasium.make(f"esad-{name}-v0", config=config)
+
+
+def test_an_unknown_town_is_named_with_those_there_are() -> None:
+    with pytest.raises(ValueError, match="there is no town05; choose one of town03, town04, town06, town07, town10"):
+        town("town05")
 
 
 def test_every_setting_is_checked() -> None:

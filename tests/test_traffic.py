@@ -79,7 +79,7 @@ def drive_ours(cars: list[dict[str, float]], steps: int) -> np.ndarray:
     return traffic.position
 
 
-@pytest.mark.parametrize("seed", range(20))
+@pytest.mark.parametrize("seed", range(50))
 def test_positions_equal_stock_after_10_s(seed: int) -> None:
     cars = crowd(seed)
     stock, changes = drive_stock(cars, steps=100)

@@ -94,5 +94,8 @@ def town(name: str) -> Town:
 
     :param name: key of ``PLANS``
     :return: the town, which nobody must change
+    :raises ValueError: if there is none of that name
     """
+    if name not in PLANS:
+        raise ValueError(f"there is no {name}; choose one of {', '.join(PLANS)}")
     return PLANS[name].build()
