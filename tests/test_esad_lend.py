@@ -612,7 +612,7 @@ def test_without_costs_the_multiplier_falls_and_with_them_it_rises() -> None:
     for env in (FreeEnv(), CountingEnv()):
         model = make_model(env, cost_limit=0.5, penalty_warmup=0, lambda_lr=0.1, learning_starts=8)
         assert isinstance(model.penalty, AugmentedLagrangian)
-        model.penalty.episodes.recent.steps = 20
+        model.penalty.episodes.road_steps = 20
         model.learn(100)
         multipliers.append(model.penalty.multiplier.item())
     assert multipliers[0] < 0.9 < 1.1 < multipliers[1]
