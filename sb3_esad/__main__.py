@@ -94,6 +94,7 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--out", type=Path, default=Path("demo"), metavar="FOLDER", help="where to write (default: %(default)s)"
     )
+    parser.add_argument("--env", default=ENV_ID, metavar="ID", help="driving scenario (default: %(default)s)")
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the training (default: %(default)s)")
     parser.add_argument(
         "--timesteps", type=_positive, default=TIMESTEPS, metavar="N", help="environment steps (default: %(default)s)"
@@ -109,7 +110,7 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
 
 def _demo(args: argparse.Namespace) -> None:
     th.set_num_threads(args.threads)
-    run_demo(args.out, args.seed, args.timesteps, args.minutes, args.episodes)
+    run_demo(args.out, args.seed, args.timesteps, args.minutes, args.episodes, args.env)
 
 
 def _positive(text: str) -> int:

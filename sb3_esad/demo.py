@@ -4,21 +4,23 @@ import os
 import platform
 import time
 from collections.abc import Mapping
+from contextlib import closing
 from importlib.metadata import version
 from pathlib import Path
 
+import gymnasium as gym
 import torch as th
 from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.save_util import whole_file
-from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
+from sb3_esad.driving_evaluation import check_scenario, evaluate_driver, evaluate_model
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.hyperparams import load_hyperparams
 from sb3_esad.plots import plot_learning_curve
 from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar
 from sb3_esad.report import Figures, format_table, summarise_any
-from sb3_esad.video import record_model, video_writer
+from sb3_esad.video import check_image, record_model, video_writer
 
 ENV_ID = "esad-highway-v0"
 TIMESTEPS, MINUTES = 20_000, 8.0
@@ -31,7 +33,14 @@ UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
 
-def run_demo(folder: Path, seed: int = 0, timesteps: int = TIMESTEPS, minutes: float = MINUTES, episodes: int = 100) -> None:
+def run_demo(
+    folder: Path,
+    seed: int = 0,
+    timesteps: int = TIMESTEPS,
+    minutes: float = MINUTES,
+    episodes: int = 100,
+    env_id: str = ENV_ID,
+) -> None:
     """
     Train, evaluate beside two simple drivers, and write model, learning curve, results and video into a folder.
 
@@ -40,27 +49,31 @@ def run_demo(folder: Path, seed: int = 0, timesteps: int = TIMESTEPS, minutes: f
     :param timesteps: environment steps at most
     :param minutes: of training at most; the learning rate falls to zero over what comes first
     :param episodes: of the evaluation
-    :raises ValueError: if the training was too short for a single episode
+    :param env_id: driving scenario
+    :raises ValueError: if the environment is no driving scenario with an image, or the training too short for an episode
     :raises ImportError: if the library that writes videos is missing
     """
     video_writer()
+    with closing(gym.make(env_id)) as env:
+        check_scenario(env, env_id)
+        check_image(env, env_id)
     folder.mkdir(parents=True, exist_ok=True)
-    model, training = train(folder, seed, timesteps, minutes)
+    model, training = train(folder, seed, timesteps, minutes, env_id)
     seeds = range(UNSEEN, UNSEEN + episodes)
     print(f"Evaluating on {episodes} unseen episodes ...", flush=True)
     columns = {
-        "ESAD-LEND": summarise_any(evaluate_model(model, ENV_ID, seeds)),
-        "holds speed and lane": summarise_any(evaluate_driver("keeper", ENV_ID, seeds)),
-        "random": summarise_any(evaluate_driver("random", ENV_ID, seeds)),
+        "ESAD-LEND": summarise_any(evaluate_model(model, env_id, seeds)),
+        "holds speed and lane": summarise_any(evaluate_driver("keeper", env_id, seeds)),
+        "random": summarise_any(evaluate_driver("random", env_id, seeds)),
     }
-    write_results(folder / "results.md", columns, training, seeds)
-    record_model(folder / "episode.mp4", model, ENV_ID, seeds[0])
+    write_results(folder / "results.md", env_id, columns, training, seeds)
+    record_model(folder / "episode.mp4", model, env_id, seeds[0])
     print(f"\n{format_table(columns)}\n\nIn brackets: 95 % intervals. Written:")
     for name in ("results.md", "learning_curve.png", "episode.mp4", "esad_lend.zip"):
         print(f"  {folder / name}")
 
 
-def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESADLEND, str]:
+def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) -> tuple[ESADLEND, str]:
     """
     Train until the steps are done or the time is over; write the model and its learning curve.
 
@@ -68,13 +81,14 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESAD
     :param seed: of the training
     :param timesteps: environment steps at most
     :param minutes: at most
+    :param env_id: driving scenario
     :return: the model, and a sentence about its training
     """
-    hyperparams = load_hyperparams(ESADLEND, "esad_lend", ENV_ID)
+    hyperparams = load_hyperparams(ESADLEND, "esad_lend", env_id)
     arguments = {**hyperparams.arguments, **FEW_UPDATES}
-    model = ESADLEND(env=make_vec_env(ENV_ID, hyperparams.n_envs), seed=seed, **arguments)
+    model = ESADLEND(env=make_vec_env(env_id, hyperparams.n_envs), seed=seed, **arguments)
     history = EpisodeHistory()
-    print(f"Training ESAD-LEND on {ENV_ID} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
+    print(f"Training ESAD-LEND on {env_id} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
     start = time.monotonic()
     model.learn(timesteps, callback=[history, EpisodeProgressBar(history), Deadline(minutes)])
     took = (time.monotonic() - start) / 60
@@ -86,18 +100,19 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float) -> tuple[ESAD
     return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
 
 
-def write_results(path: Path, columns: Mapping[str, Figures], training: str, seeds: range) -> None:
+def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:
     """
     Write the table, and all that is needed to get it again.
 
     :param path: where to
+    :param env_id: driving scenario
     :param columns: figures by the name of the driver
     :param training: a sentence about it
     :param seeds: of the evaluation
     """
     versions = ", ".join(f"{name} {version(name)}" for name in ("stable_baselines3", "torch", "gymnasium", "numpy"))
     lines = [
-        f"# ESAD-LEND on {ENV_ID}",
+        f"# ESAD-LEND on {env_id}",
         "",
         training,
         f"Evaluated on {len(seeds)} episodes with the seeds {seeds[0]} to {seeds[-1]}, by the best action, not a sampled one.",

@@ -36,8 +36,7 @@ def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, determinis
     """
     with closing(_make(env_id)) as env:
         check_spaces(model, env, env_id)
-        if _image_of(env.observation_space.sample()) is None:
-            raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
+        check_image(env, env_id)
         driver = DreamingDriver(model, deterministic=deterministic)
         write_video(path, _drive_dreaming(env, driver, seed), env.metadata["render_fps"])
 
@@ -78,6 +77,18 @@ def write_video(path: Path, frames: Iterable[Picture], fps: int) -> None:
         writer.send(None)
         for picture in chain([first], pictures):
             writer.send(np.ascontiguousarray(picture))
+
+
+def check_image(env: gym.Env[Any, Any], env_id: str) -> None:
+    """
+    Refuse an environment of which no dream can be shown.
+
+    :param env: environment
+    :param env_id: its name
+    :raises ValueError: if there is no image in its observations
+    """
+    if _image_of(env.observation_space.sample()) is None:
+        raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
 
 
 def video_writer() -> Any:

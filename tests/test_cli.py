@@ -181,3 +181,14 @@ def test_it_runs_as_a_module() -> None:
     command = [sys.executable, "-W", "error", "-m", "sb3_esad", "--version"]
     result = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1], check=False)
     assert (result.returncode, result.stdout, result.stderr) == (0, f"sb3_esad {__version__}\n", "")
+
+
+@pytest.mark.parametrize(
+    ("env_id", "reason"), [("CartPole-v1", "is no driving scenario"), ("esad-course-vector-v0", "has no image")]
+)
+def test_the_demo_refuses_what_it_could_not_film_before_it_trains(
+    env_id: str, reason: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["demo", "--env", env_id, "--out", str(tmp_path / "demo")]) == 2
+    assert f"{env_id} {reason}" in capsys.readouterr().err
+    assert not (tmp_path / "demo").exists()
