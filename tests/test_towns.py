@@ -186,7 +186,7 @@ def street(speed: float, x: float = 0.0, y: float = 0.0) -> User:
 def walk(cars: list[User], ends: list[list[list[float]]], speed: float, steps: int) -> tuple[Traffic, list[Any]]:
     """Let people walk among cars that hold their speed, 5 decisions a second, and note where they are."""
     road = Road([Lane((-100.0, 0.0), 0.0, 300.0, width=30.0)], NOTHING)
-    walkers = Walkers(np.random.default_rng(0), np.array(ends), speed, (0.0, 0.0))
+    walkers = Walkers(np.random.default_rng(0), np.array(ends), speed, (0.0, 0.0), caution=1.0)
     traffic, places = Traffic(road, [*cars, *walkers.people()]), []
     people = traffic.kind == Kind.PERSON
     for step in range(steps):

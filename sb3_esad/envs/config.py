@@ -81,7 +81,7 @@ RULES = (
     Rule(
         """
             velocity_sharpness orientation_sharpness exploration_decay traffic_behind traffic_ahead
-            desired_speed_spread slowdown_speed slowdown_duration
+            desired_speed_spread slowdown_speed slowdown_duration walking_caution
         """.split(),
         lambda value: _is_finite(value) and value >= 0,
         "a number from 0 on",

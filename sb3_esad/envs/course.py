@@ -60,6 +60,7 @@ class Course(Scenario):
             "people": 0,
             "walking_speed": 1.0,
             "walking_pause": (0.0, 2.0),
+            "walking_caution": 0.0,
             "vehicle_size": (1.2, 0.8),
             "start_speed": (1.5, 2.0),
             "target_speed": 2.0,
@@ -87,7 +88,7 @@ class Course(Scenario):
         ego = User(place, speed=speed, target_speed=config["target_speed"], drives=False, size=size)
         obstacles = self._place_obstacles(int(random.integers(config["obstacles"][0], config["obstacles"][1] + 1)))
         ends = self._draw_walks(obstacles)
-        self.walkers = Walkers(random, ends, config["walking_speed"], config["walking_pause"])
+        self.walkers = Walkers(random, ends, config["walking_speed"], config["walking_pause"], config["walking_caution"])
         return Traffic(self.road, [ego, *obstacles, *self.walkers.people()])
 
     def _place_obstacles(self, count: int) -> list[User]:

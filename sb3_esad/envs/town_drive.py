@@ -19,6 +19,7 @@ from sb3_esad.envs.walkers import Walkers
 
 LIGHTS_SEEN = 40.0  # from as far before a junction [m]
 CROSSING, KERB = 4.0, 2.0  # people cross this far before the line, from this far beside the road [m]
+ATTEMPTS = 100
 APART = 14.0  # nobody is placed nearer to someone else of the same lane than this [m]
 
 
@@ -48,10 +49,19 @@ class TownDrive(NetworkDrive):
         return self.town.road
 
     def _plan(self) -> tuple[list[int], float, float]:
-        first, start = self._draw_place(1 if self.config["spawn"] == "fixed" else len(self.town.streets))
-        lanes = self._walk(first, self.config["route_length"] + start)
+        lanes, start = self._draw_route()
         before = sum(float(self.road.length[lane]) for lane in lanes[:-1])
         return lanes, start, min(self.config["route_length"] + start - before, float(self.road.length[lanes[-1]]))
+
+    def _draw_route(self) -> tuple[list[int], float]:
+        """Lanes of a route that passes no street twice, for its progress must be known, and where it starts on the first."""
+        for _ in range(ATTEMPTS):
+            first, start = self._draw_place(1 if self.config["spawn"] == "fixed" else len(self.town.streets))
+            lanes = self._walk(first, self.config["route_length"] + start)
+            if len(set(self.road.row_of[lanes].tolist())) == len(lanes):
+                return lanes, start
+        remedy = "choose a shorter one"
+        raise ValueError(f"route_length {self.config['route_length']} leads through {self.town_name} in circles; {remedy}")
 
     def _draw_place(self, streets: int) -> tuple[int, float]:
         """A place on one of the first streets: a lane, and the distance from its start [m]."""
@@ -103,6 +113,7 @@ class LitTown(TownDrive):
             "people": 16,
             "walking_speed": 1.2,
             "walking_pause": (2.0, 12.0),
+            "walking_caution": 0.6,
         }
 
     def _make_road(self) -> Road:
@@ -115,7 +126,9 @@ class LitTown(TownDrive):
     def _place_others(self, population: Population) -> list[User]:
         cars, config = super()._place_others(population), self.config
         ends = np.array([self._draw_crossing() for _ in range(config["people"])]).reshape(-1, 2, 2)
-        self.walkers = Walkers(self.np_random, ends, config["walking_speed"], config["walking_pause"])
+        self.walkers = Walkers(
+            self.np_random, ends, config["walking_speed"], config["walking_pause"], config["walking_caution"]
+        )
         return [*cars, *self.walkers.people()]
 
     def _draw_crossing(self) -> list[Floats]:

@@ -11,7 +11,6 @@ PERSON_SIZE = (0.6, 0.6)  # [m]
 BERTH, BERTH_OF_STANDING = 0.6, 0.45  # people keep this far away from a car, and from one that stands, centre to side [m]
 LOOK, LOOK_NEAR_STANDING = 1.0, 0.25  # they look as far ahead [m], and past a car that stands [s]
 PATIENCE = 1.5  # who cannot go on for so long turns round [s]
-WARNING = 1.0  # nobody steps in front of a car that would be there within this time [s]
 
 
 class Walkers:
@@ -22,13 +21,17 @@ class Walkers:
     :param ends: the two places of each, shape ``(n, 2, 2)`` [m]
     :param speed: of their walk [m/s]
     :param pause: shortest and longest time of waiting [s]
+    :param caution: nobody steps in front of a car that would be there within this time [s]
     """
 
-    def __init__(self, random: np.random.Generator, ends: Floats, speed: float, pause: tuple[float, float]) -> None:
+    def __init__(
+        self, random: np.random.Generator, ends: Floats, speed: float, pause: tuple[float, float], caution: float
+    ) -> None:
         self._random = random
         self._ends = ends
         self._speed = speed
         self._pause = pause
+        self._caution = caution
         self._goal = np.zeros(len(ends), dtype=np.int64)
         self._departure = random.uniform(0.0, pause[1], len(ends))
         self._held_up_since = np.full(len(ends), np.inf)
@@ -62,7 +65,7 @@ class Walkers:
         self._goal[turning] = 1 - self._goal[turning]
 
     def _must_wait(self, traffic: Traffic, rows: Ints) -> Bools:
-        """Nobody walks into a car, nor steps in front of one that drives; who is in front of one already walks on."""
+        """Nobody walks into a car, nor right in front of one; who is in front of one already walks on."""
         cars = np.flatnonzero(traffic.kind == Kind.VEHICLE)
         stands, heading = traffic.speed[cars] < 0.1, traffic.heading[rows]
         step = (
@@ -73,7 +76,7 @@ class Walkers:
         (along, across), (_, across_now) = _in_frame_of(traffic, cars, here + step), _in_frame_of(traffic, cars, here)
         length, width = traffic.size[cars].T / 2 + np.where(stands, BERTH_OF_STANDING, BERTH)
         touches = (np.abs(along) < length) & (np.abs(across) < width)
-        steps_in_front = (along > 0) & (along < length + WARNING * traffic.speed[cars])
+        steps_in_front = (along > 0) & (along < length + self._caution * traffic.speed[cars])
         steps_in_front &= (np.abs(across) < width) & (np.abs(across_now) >= width)
         return np.asarray((touches | steps_in_front).any(1))
 
