@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from sb3_esad.envs.bev import BirdsEyeView, View
+from sb3_esad.envs.geometry import box_corners
 from sb3_esad.envs.highway import highway_road
+from sb3_esad.envs.lights import NO_LINES, StopLines
 from sb3_esad.envs.roads import Markings
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
@@ -15,7 +17,6 @@ VIEW = View(SHAPE, SCALE, AHEAD)
 BEV = BirdsEyeView(VIEW)
 ROAD = highway_road(3, 600.0, 200.0, 150.0)
 ROUTE = np.array([True, True, True, False, False])
-NO_LINES = np.zeros((0, 4, 2))
 
 
 def scene(*users: User) -> Traffic:
@@ -126,3 +127,12 @@ def test_other_sizes_and_scales() -> None:
     assert image.shape == (3, 96, 48)
     assert image.dtype == np.uint8
     assert np.flatnonzero(image[2][:, 4:-4].any(1)).mean() == pytest.approx(96 * 0.75 - 0.5, abs=1.0)
+
+
+def test_an_amber_light_s_line_is_less_bright_than_a_red_one_s() -> None:
+    places = ((70.0, 2.0), (80.0, 6.0))
+    corners = box_corners(np.array(places), np.zeros(2), np.array([[4.0, 3.0]] * 2))
+    image = BEV.draw(BARE, ROUTE, scene(ego()), StopLines(corners, np.array([True, False])), 0.0)[2]
+    values = set(np.unique(image).tolist())
+    assert {255, 210} <= values
+    assert not {255, 210} & set(np.unique(BEV.draw(BARE, ROUTE, scene(ego()), NO_LINES, 0.0)[2]).tolist())

@@ -105,7 +105,7 @@ def test_multiplier_moves_whatever_callback_the_user_has() -> None:
         [CountCalls(), CountCalls()],
         function,
         LagrangeCallback(),
-        [LagrangeCallback()],
+        [CallbackList([LagrangeCallback(), CountCalls()])],
     ]
     for callback in choices:
         model = make_model()
@@ -172,7 +172,7 @@ def record_logs(model: SAC) -> dict[str, list[Any]]:
 
 
 def test_prepend_keeps_callback_lists() -> None:
-    first, second = CountCalls(), CallbackList([CountCalls()])
+    first, second = LagrangeCallback(), CallbackList([CountCalls()])
     assert prepend(first, second) == [first, second]
     assert len(prepend(first, None)) == 2
 

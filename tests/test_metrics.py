@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from sb3_esad.envs.course import hall
-from sb3_esad.envs.episode import LONGEST_TTC, Episode
+from sb3_esad.envs.episode import LONGEST_TTC, CourseEpisode, Episode
 from sb3_esad.envs.hazards import clearance, time_to_collision
 from sb3_esad.envs.highway import highway_road
 from sb3_esad.envs.intervals import bootstrap_interval, mean_interval, poisson_interval, wilson_interval, worst_mean
@@ -205,7 +205,7 @@ def test_resampled_interval_holds_the_truth_of_a_tail() -> None:
 
 def test_the_course_s_figures_by_hand() -> None:
     """Two episodes of 4 and 6 m, one of which hits something; half of the first path and two thirds of the other have room."""
-    free, hit = Episode(10.0), Episode(10.0)
+    free, hit = CourseEpisode(10.0), CourseEpisode(10.0)
     for room, turned in ((0.6, 0.1), (0.5, -0.4)):
         free.add_motion(1.0, 2.0, 2.0, on_route=True)
         free.add_path(2.0, turned, room)
@@ -221,6 +221,7 @@ def test_the_course_s_figures_by_hand() -> None:
     assert figures["safety"] == pytest.approx(100 * 0.5 * 6.0 / 10.0)
     assert 0.0 <= figures["safety_low"] <= figures["safety"] <= figures["safety_high"] <= 100.0
     assert (figures["path"], figures["curvature"], figures["duration"]) == (5.0, pytest.approx(0.1), 2.5)
+    assert not {"path", "curvature", "safety"} & set(summarise([perfect().record(True)]))
 
 
 def test_room_to_what_is_nearest() -> None:

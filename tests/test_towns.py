@@ -8,7 +8,7 @@ import pytest
 
 from sb3_esad.envs.drivers import SpeedKeeper
 from sb3_esad.envs.lanes import NO_LANE, Lane
-from sb3_esad.envs.lights import ALL_RED, AMBER, GREEN, SETBACK, TrafficLights
+from sb3_esad.envs.lights import AMBER, PERIOD, SETBACK, TrafficLights
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Markings, Road, dashes
 from sb3_esad.envs.towns import PLANS, town
@@ -123,8 +123,8 @@ def test_nobody_starts_faster_than_the_lane_allows(name: str) -> None:
         assert env.traffic.speed[EGO] <= env.road.speed_limit[env.route.lanes[0]]
 
 
-def before_a_light(speed: float, distance: float, red_for: float) -> Any:
-    """Town 10 without anybody else; the agent comes to a light that has been red for some time."""
+def before_a_light(speed: float, distance: float, closed_for: float) -> Any:
+    """Town 10 without anybody else; the agent comes to a light that has not been green for some time."""
     env: Any = gymnasium.make("esad-town10-vector-v0", config={"cars": 0, "people": 0}).unwrapped
     for seed in range(50):
         env.reset(seed=seed)
@@ -134,11 +134,11 @@ def before_a_light(speed: float, distance: float, red_for: float) -> Any:
             env.traffic.position[EGO] = env.road.position(lane, float(env.road.length[lane]) - 30.0)
             env.traffic.move(0.0)
             way = env.right_of_way.way_ahead(env.traffic, EGO)
-        times = np.arange(0.0, 2 * (GREEN + ALL_RED), 0.1)
-        red = [env.lights.red(time)[way[0]] for time in times]
-        if red[0] or not any(red):
+        times = np.arange(0.0, PERIOD, 0.1)
+        closed = [env.lights.closed(time)[way[0]] for time in times]
+        if closed[0] or not any(closed):
             continue
-        env.episode.time = float(times[red.index(True)]) + red_for - 1 / env.config["policy_frequency"]
+        env.episode.time = float(times[closed.index(True)]) + closed_for - 1 / env.config["policy_frequency"]
         env.traffic.position[EGO] = env.road.position(lane, float(env.road.length[lane]) - SETBACK - distance)
         env.traffic.speed[EGO] = speed
         env.traffic.move(0.0)
@@ -146,9 +146,9 @@ def before_a_light(speed: float, distance: float, red_for: float) -> Any:
     raise AssertionError("no episode begins before a light")
 
 
-@pytest.mark.parametrize(("red_for", "infractions"), [(0.5, 0), (AMBER - 0.3, 0), (AMBER + 0.3, 1), (6.0, 1)])
-def test_a_red_light_counts_once_and_not_as_long_as_it_could_have_been_amber(red_for: float, infractions: int) -> None:
-    env = before_a_light(speed=8.0, distance=1.0, red_for=red_for)
+@pytest.mark.parametrize(("closed_for", "infractions"), [(0.5, 0), (AMBER - 0.3, 0), (AMBER + 0.3, 1), (6.0, 1)])
+def test_a_red_light_counts_once_and_an_amber_one_does_not(closed_for: float, infractions: int) -> None:
+    env = before_a_light(speed=8.0, distance=1.0, closed_for=closed_for)
     hold, costs = SpeedKeeper(), 0.0
     for _ in range(6):
         _, _, terminated, _, info = env.step(hold(env))
@@ -160,9 +160,9 @@ def test_a_red_light_counts_once_and_not_as_long_as_it_could_have_been_amber(red
 
 
 @pytest.mark.parametrize(("distance", "stops"), [(30.0, True), (8.0, True), (3.0, False)])
-def test_a_light_that_turns_red_stops_those_who_can(distance: float, stops: bool) -> None:
+def test_a_light_that_turns_amber_stops_those_who_can(distance: float, stops: bool) -> None:
     """At 9 m/s one needs 6.75 m."""
-    env = before_a_light(speed=9.0, distance=distance, red_for=0.2)
+    env = before_a_light(speed=9.0, distance=distance, closed_for=0.2)
     env._before_physics()
     assert (env.traffic.stop_distance[EGO] < np.inf) == stops
     if stops:
@@ -172,7 +172,7 @@ def test_a_light_that_turns_red_stops_those_who_can(distance: float, stops: bool
 def test_lines_before_lights_leave_room_for_people() -> None:
     plan = town("town10")
     lights = TrafficLights(plan.road, plan.ways, np.zeros(16))
-    centres = lights.red_lines(0.0).mean(1)
+    centres = lights.lines(0.0).corners.mean(1)
     ends = np.array([plan.road.end(way.source) for way in plan.ways])
     nearest = np.hypot(*(centres[:, None] - ends[None]).transpose(2, 0, 1)).min(1)
     np.testing.assert_allclose(nearest, SETBACK, atol=1e-6)

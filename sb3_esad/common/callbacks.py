@@ -5,7 +5,7 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
-from stable_baselines3.common.callbacks import BaseCallback, ConvertCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, CallbackList, ConvertCallback, EvalCallback
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
@@ -23,7 +23,13 @@ def prepend(first: BaseCallback, callback: MaybeCallback) -> list[BaseCallback]:
     """
     given = callback if isinstance(callback, list) else [callback]
     others = [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in given]
-    return others if any(type(each) is type(first) for each in others) else [first, *others]
+    return others if any(_holds(each, type(first)) for each in others) else [first, *others]
+
+
+def _holds(callback: BaseCallback, kind: type[BaseCallback]) -> bool:
+    """Whether a callback is of a kind, or a list with one of it."""
+    inner = callback.callbacks if isinstance(callback, CallbackList) else []
+    return isinstance(callback, kind) or any(_holds(each, kind) for each in inner)
 
 
 class LagrangeCallback(BaseCallback):

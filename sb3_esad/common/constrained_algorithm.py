@@ -170,25 +170,6 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         residual[:-steps] = barrier_residual(risk[steps:], risk[:-steps], self.penalty.budget, self.barrier_decay)
         return residual
 
-    def set_parameters(
-        self,
-        load_path_or_dict: str | dict[str, Any],
-        exact_match: bool = True,
-        device: th.device | str = "auto",
-    ) -> None:
-        """
-        Load parameters; a limit where there was none begins with a multiplier of its own, which no limit does not have.
-
-        :param load_path_or_dict: see SB3's ``BaseAlgorithm.set_parameters``
-        :param exact_match: likewise
-        :param device: likewise
-        """
-        if isinstance(load_path_or_dict, dict) and "penalty" in load_path_or_dict:
-            own = self.penalty.state_dict()
-            if bool(own) != bool(load_path_or_dict["penalty"]):
-                load_path_or_dict = {**load_path_or_dict, "penalty": own}
-        super().set_parameters(load_path_or_dict, exact_match, device)
-
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         names, variables = super()._get_torch_save_params()
         return [*names, "penalty"], variables

@@ -1,6 +1,7 @@
 """How a cost limit enters learning and acting, and the absence of one."""
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,18 @@ from sb3_esad.common.type_aliases import Logs
 
 class Penalty(nn.Module, ABC):
     """How a cost limit enters the actor's loss and the choice of actions."""
+
+    def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
+        """
+        Go on from a saved state; a limit where there was none begins anew, and where there is none now nothing is needed.
+
+        :param state_dict: of any penalty, empty for that of :class:`NoPenalty`
+        :param strict: see torch's ``Module.load_state_dict``
+        :param assign: likewise
+        :return: likewise
+        """
+        own = self.state_dict()
+        return super().load_state_dict(state_dict if bool(state_dict) == bool(own) else own, strict, assign)
 
     @property
     @abstractmethod

@@ -52,10 +52,11 @@ class WholeFiles(OffPolicyAlgorithm):
         except ValueError:
             raise
         except Exception as error:  # what is read may be anything
-            reason = "was saved by another version of sb3_esad, or the arguments given to load() change its networks"
+            reason = "was saved by another version of sb3_esad, or the arguments given to load() do not fit it"
             # SB3 looks for another cause of a ValueError, in vain, and raises what it stumbles over
             cause = error.__context__ if isinstance(error.__context__, ValueError) else error
-            raise ValueError(f"The model in {path} {reason} ({str(cause).partition(chr(10))[0]}).") from error
+            what = f"{type(cause).__name__}: {str(cause).partition(chr(10))[0]}"
+            raise ValueError(f"The model in {path} {reason} ({what}).") from error
 
     def save_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase) -> None:
         """

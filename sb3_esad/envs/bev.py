@@ -7,6 +7,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from sb3_esad.envs.geometry import Floats, box_corners
+from sb3_esad.envs.lights import StopLines
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Bools, Markings
 from sb3_esad.envs.traffic import Traffic
@@ -19,6 +20,7 @@ SUBPIXEL_BITS = 4
 BLEED = 0.7 * 2**SUBPIXEL_BITS  # measured: a filled shape comes out this much larger on every side [px / 16]
 STANDING_GREY, USER_SPAN, EGO_SPAN, OBSTACLE_GREY = 95, 160, 100, 255
 TOP_SPEED = 40.0  # the speed of the brightest grey level [m/s]
+AMBER_GREY = 210  # of the line before an amber light
 DIAL_SPEED, DIAL_GREY = 32.0, 160  # the speed at which the dial is as high as the image [m/s]
 DIAL_SHARE = 1 / 16  # of the image's width, at either edge
 OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
@@ -137,7 +139,7 @@ class BirdsEyeView:
 
     Channel 0 is the road: surface, brighter where the route leads, and painted lines. Channel 1 holds the moving users,
     brighter the faster they are. Channel 2 holds the ego vehicle, brightened likewise, its speed as a dial at both edges, and
-    what must not be hit at 255.
+    what must not be hit at 255; the line before a light is less bright while it is amber.
 
     :param view: size and scale of the image
     """
@@ -145,14 +147,14 @@ class BirdsEyeView:
     def __init__(self, view: View) -> None:
         self.view = view
 
-    def draw(self, markings: Markings, route: Bools, traffic: Traffic, red_lines: Floats, heading: float) -> Image:
+    def draw(self, markings: Markings, route: Bools, traffic: Traffic, stop_lines: StopLines, heading: float) -> Image:
         """
         Draw the surroundings of the ego vehicle.
 
         :param markings: of the road
         :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
         :param traffic: all road users
-        :param red_lines: corners of the lines before red lights, shape ``(n, 4, 2)`` [m]
+        :param stop_lines: before lights that are not green
         :param heading: the direction that points up [rad]
         :return: the image, shape ``(3, rows, columns)``
         """
@@ -164,10 +166,12 @@ class BirdsEyeView:
         moves[EGO] = False
         surfaces, on_route = markings.with_route_on_top(route)
         asphalt = view.pixels(surfaces, origin, heading)
-        boxes = inset(view.pixels(np.concatenate([red_lines, corners]), origin, heading))
-        layers = [road] * len(asphalt) + [obstacles] * len(red_lines) + [users if moving else obstacles for moving in moves]
+        boxes = inset(view.pixels(np.concatenate([stop_lines.corners, corners]), origin, heading))
+        layers = (
+            [road] * len(asphalt) + [obstacles] * len(stop_lines.red) + [users if moving else obstacles for moving in moves]
+        )
         greys = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist()
-        greys += [OBSTACLE_GREY] * len(red_lines) + user_greys(traffic)
+        greys += np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY).tolist() + user_greys(traffic)
         view.fill(layers, np.concatenate([asphalt, boxes]), greys)
         paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
         view.lines(road, view.pixels(markings.lines, origin, heading), paint)

@@ -3,7 +3,9 @@
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from sb3_esad.envs.episode import CourseEpisode
 from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.hazards import clearance
 from sb3_esad.envs.lanes import Lane
@@ -46,6 +48,8 @@ def _room(x: float, y: float, side: float, other: User) -> float:
 
 class Course(Scenario):
     """Reach the goal 40 to 50 m ahead at 2 m/s among obstacles, sparse to dense. See :class:`Scenario`."""
+
+    episode: CourseEpisode
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
@@ -120,8 +124,14 @@ class Course(Scenario):
     def _before_physics(self) -> None:
         self.walkers.walk(self.traffic, self.episode.time)
 
-    def _clearance(self) -> float:
-        return clearance(self.road, self.traffic)
+    def _start_episode(self) -> CourseEpisode:
+        return CourseEpisode(self.route.length)
+
+    def _drive(self, action: NDArray[np.floating]) -> None:
+        heading, metres = float(self.traffic.heading[EGO]), self.episode.distance
+        super()._drive(action)
+        turned, driven = float(self.traffic.heading[EGO]) - heading, self.episode.distance - metres
+        self.episode.add_path(driven, turned, clearance(self.road, self.traffic))
 
     def _progress(self) -> float:
         return float(self.traffic.position[EGO, 0])

@@ -18,7 +18,7 @@ Colour = tuple[int, int, int]
 SIZE, AHEAD, ZOOM = (960, 320), 0.75, 10.0  # [px], share of what is seen, and pixels for each of those of the agent's image
 GRASS, ASPHALT, ROUTE, PAINT = (44, 62, 48), (70, 70, 74), (92, 92, 98), (225, 225, 225)
 EGO_COLOUR, CRASH_COLOUR, STATIC_COLOUR, PERSON_COLOUR = (64, 220, 110), (235, 60, 50), (240, 150, 40), (240, 90, 200)
-RED = (220, 40, 40)
+RED, AMBER = (220, 40, 40), (240, 180, 40)
 SLOW_COLOUR, FAST_COLOUR = np.array([60.0, 90.0, 170.0]), np.array([130.0, 200.0, 255.0])
 FASTEST = 30.0  # [m/s]
 
@@ -41,8 +41,9 @@ def draw_scene(scenario: Scenario) -> Image:
     view.fill([canvas] * len(asphalt), view.pixels(surfaces, origin, heading), asphalt)
     lines = view.pixels(markings.lines, origin, heading)
     view.lines(canvas, lines, [PAINT] * len(lines), 2)
-    red = view.pixels(scenario.red_lines, origin, heading)
-    view.fill([canvas] * len(red), red, [RED] * len(red))
+    stop_lines = scenario.stop_lines
+    colours = [RED if red else AMBER for red in stop_lines.red]
+    view.fill([canvas] * len(colours), view.pixels(stop_lines.corners, origin, heading), colours)
     boxes = view.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)
     view.fill([canvas] * len(boxes), boxes, [_colour(scenario, row) for row in range(len(boxes))])
     picture = np.ascontiguousarray(np.rot90(canvas, -1))

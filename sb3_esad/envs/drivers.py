@@ -12,7 +12,7 @@ from sb3_esad.envs.course_driver import CourseDriver
 from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario, scenario_of
-from sb3_esad.envs.traffic import GET_BACK
+from sb3_esad.envs.traffic import Traffic
 
 Driver = Callable[[gymnasium.Env[Any, Any]], NDArray[np.float32]]
 
@@ -87,8 +87,8 @@ class ReferenceDriver(CarFollower):
         """Fall back behind who is in the way of getting back; get out from behind an obstacle at a walking pace."""
         traffic, wanted = scenario.traffic, super()._acceleration(scenario, lane)
         own_lane = int(traffic.lane[EGO])
-        if lane == own_lane and self._must_get_back(scenario, lane):
-            return min(wanted, max(self._following(scenario, int(scenario.route.back[lane])), -FALL_BACK))
+        if lane == own_lane and self._must_get_back(traffic, lane):
+            return min(wanted, max(self._following(scenario, int(traffic.towards_path[EGO, lane])), -FALL_BACK))
         if lane != own_lane and self._is_behind_obstacle(scenario):  # to follow the obstacle would be to stay
             return max(wanted, min(CREEP_SPEED - float(traffic.speed[EGO]), self._following(scenario, lane)))
         return wanted
@@ -99,9 +99,8 @@ class ReferenceDriver(CarFollower):
         return front[0] >= 0 and traffic.speed[front[0]] == 0 and traffic.distance(_SELF, front)[0] >= CREEP_ROOM
 
     @staticmethod
-    def _must_get_back(scenario: Scenario, lane: int) -> bool:
-        left = scenario.road.length[lane] - scenario.traffic.along[lane, EGO]
-        return len(scenario.route.lanes) > 1 and scenario.route.contains[lane] and left < GET_BACK
+    def _must_get_back(traffic: Traffic, lane: int) -> bool:
+        return bool(traffic.must_get_back(_SELF, np.array([lane]))[0])
 
     @staticmethod
     def _is_settled(scenario: Scenario, lane: int) -> bool:
@@ -112,10 +111,11 @@ class ReferenceDriver(CarFollower):
     @staticmethod
     def _best_lane(scenario: Scenario, lane: int) -> int:
         road, traffic, route = scenario.road, scenario.traffic, scenario.route
-        if ReferenceDriver._must_get_back(scenario, lane):
-            back = int(route.back[lane])
+        if ReferenceDriver._must_get_back(traffic, lane):
+            back = int(traffic.towards_path[EGO, lane])
             return back if traffic.change_is_safe(_SELF, np.array([back]))[0] else lane
         beside = [int(each) for each in (road.left[lane], road.right[lane]) if each != NO_LANE and route.contains[each]]
+        beside = [each for each in beside if not ReferenceDriver._must_get_back(traffic, each)]
         worth = [each for each in beside if traffic.change_is_worth_it(_SELF, np.array([each]))[0]]
         return max(worth, key=lambda each: CarFollower._following(scenario, each)) if worth else lane
 

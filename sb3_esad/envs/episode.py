@@ -23,7 +23,6 @@ class Episode:
         self.infractions = dict.fromkeys(PENALTIES, 0)
         self.steps = 0
         self.time = self.distance = self.off_route = self.furthest = 0.0
-        self.clear_distance = self.max_curvature = 0.0
         self.total_reward = self.total_cost = 0.0
         self.min_ttc = LONGEST_TTC
 
@@ -41,18 +40,6 @@ class Episode:
         self.distance += metres
         self.off_route += 0.0 if on_route else metres
         self.furthest = max(self.furthest, progress)
-
-    def add_path(self, metres: float, turned: float, clearance: float) -> None:
-        """
-        Note what the path of a step was like.
-
-        :param metres: driven [m]
-        :param turned: by how much the vehicle turned, either sign [rad]
-        :param clearance: room to what is nearest, at its end [m]
-        """
-        self.clear_distance += metres if clearance > CLEAR else 0.0
-        if metres > SHORTEST:
-            self.max_curvature = max(self.max_curvature, abs(turned) / metres)
 
     def add_outcome(self, reward: float, cost: float, ttc: float) -> None:
         """
@@ -93,8 +80,6 @@ class Episode:
             **{f"infractions_{name}": float(count) for name, count in self.infractions.items()},
             "distance": self.distance,
             "off_route": self.off_route,
-            "clear_distance": self.clear_distance,
-            "max_curvature": self.max_curvature,
             "duration": self.time,
             "steps": float(self.steps),
             "mean_speed": self.distance / self.time if self.time > 0 else 0.0,
@@ -102,3 +87,32 @@ class Episode:
             "return": self.total_reward,
             "cost": self.total_cost,
         }
+
+
+class CourseEpisode(Episode):
+    """
+    Adds up also what the path was like.
+
+    :param route_length: [m]
+    """
+
+    def __init__(self, route_length: float) -> None:
+        super().__init__(route_length)
+        self.clear_distance = self.max_curvature = 0.0
+
+    def add_path(self, metres: float, turned: float, clearance: float) -> None:
+        """
+        Note what the path of a step was like.
+
+        :param metres: driven [m]
+        :param turned: by how much the vehicle turned, either sign [rad]
+        :param clearance: room to what is nearest, at its end [m]
+        """
+        self.clear_distance += metres if clearance > CLEAR else 0.0
+        if metres > SHORTEST:
+            self.max_curvature = max(self.max_curvature, abs(turned) / metres)
+
+    def record(self, success: bool) -> Record:
+        """See :meth:`Episode.record`; with the metres that had room on all sides, and the largest curvature [1/m]."""
+        path = {"clear_distance": self.clear_distance, "max_curvature": self.max_curvature}
+        return {**super().record(success), **path}

@@ -1,6 +1,6 @@
 """What the ego vehicle has hit, and how soon it would hit what is in its path."""
 
-from typing import Protocol
+from typing import NamedTuple
 
 import numpy as np
 
@@ -62,31 +62,25 @@ def clearance(road: Road, traffic: Traffic) -> float:
     return min(room, float(box_distances(corners, others).min()))
 
 
-class Moving(Protocol):
-    """Road users as arrays, the ego vehicle first."""
+class Bodies(NamedTuple):
+    """
+    Road users that are none of ours, the ego vehicle first; all that a time to collision depends on.
 
-    @property
-    def position(self) -> Floats:
-        """Centres, shape ``(n, 2)`` [m]."""
+    :param position: centres, shape ``(n, 2)`` [m]
+    :param direction: unit vectors, shape ``(n, 2)``
+    :param speed: shape ``(n,)`` [m/s]
+    :param velocity: shape ``(n, 2)`` [m/s]
+    :param size: length and width, shape ``(n, 2)`` [m]
+    """
 
-    @property
-    def direction(self) -> Floats:
-        """Unit vectors, shape ``(n, 2)``."""
-
-    @property
-    def speed(self) -> Floats:
-        """Shape ``(n,)`` [m/s]."""
-
-    @property
-    def velocity(self) -> Floats:
-        """Shape ``(n, 2)`` [m/s]."""
-
-    @property
-    def size(self) -> Floats:
-        """Length and width, shape ``(n, 2)`` [m]."""
+    position: Floats
+    direction: Floats
+    speed: Floats
+    velocity: Floats
+    size: Floats
 
 
-def time_to_collision(traffic: Moving) -> float:
+def time_to_collision(traffic: Traffic | Bodies) -> float:
     """
     Smallest distance over closing speed to any user in the ego vehicle's path, if both kept their velocities.
 

@@ -1,6 +1,7 @@
 """Traffic lights: at a junction the streets of one direction have green while those across have red."""
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -8,10 +9,25 @@ from sb3_esad.envs.geometry import Floats, box_corners
 from sb3_esad.envs.networks import Way
 from sb3_esad.envs.roads import Bools, Road
 
-GREEN, ALL_RED = 8.0, 3.0  # for one direction, and for all of them after it [s]
-AMBER = 2.0  # who cannot stop any more may pass a light that has been red for no longer than this [s]
+GREEN, AMBER, CLEARING = 8.0, 2.0, 1.0  # for one direction, then amber, then red for all [s]
+PERIOD = 2 * (GREEN + AMBER + CLEARING)  # of both directions [s]
 SETBACK = 7.0  # one stops so far before the junction, for people cross in between [m]
 LINE_DEPTH = 1.0  # of the line to stop at, along the lane [m]
+
+
+class StopLines(NamedTuple):
+    """
+    Lines that one had better not cross.
+
+    :param corners: shape ``(n, 4, 2)`` [m]
+    :param red: whether the light is red already, not amber, shape ``(n,)``
+    """
+
+    corners: Floats
+    red: Bools
+
+
+NO_LINES = StopLines(np.zeros((0, 4, 2)), np.zeros(0, dtype=bool))
 
 
 class TrafficLights:
@@ -33,6 +49,19 @@ class TrafficLights:
         size = np.tile([LINE_DEPTH, road.width[0]], (len(lines), 1))
         self._lines = box_corners(ends, heading[np.unique(self._line_of, return_index=True)[1]], size)
 
+    def _phase(self, time: float) -> Floats:
+        """Time since each way's light turned green [s]."""
+        return np.asarray((time + self._ahead - np.where(self._across, PERIOD / 2, 0.0)) % PERIOD)
+
+    def closed(self, time: float) -> Bools:
+        """
+        Tell which ways have amber or red: who can stop, stops.
+
+        :param time: since the start [s]
+        :return: one truth value per way
+        """
+        return self._phase(time) >= GREEN
+
     def red(self, time: float) -> Bools:
         """
         Tell which ways must not be entered.
@@ -40,24 +69,14 @@ class TrafficLights:
         :param time: since the start [s]
         :return: one truth value per way
         """
-        phase = (time + self._ahead) % (2 * (GREEN + ALL_RED))
-        green = np.where(self._across, (phase >= GREEN + ALL_RED) & (phase < 2 * GREEN + ALL_RED), phase < GREEN)
-        return ~green
+        return self._phase(time) >= GREEN + AMBER
 
-    def forbidden(self, time: float) -> Bools:
+    def lines(self, time: float) -> StopLines:
         """
-        Tell which ways nobody may enter any more, not even those who could not stop.
+        Show where one stops.
 
         :param time: since the start [s]
-        :return: one truth value per way
+        :return: the lines before all lights that are not green
         """
-        return self.red(time) & self.red(time - AMBER)
-
-    def red_lines(self, time: float) -> Floats:
-        """
-        Show where one must stop.
-
-        :param time: since the start [s]
-        :return: corners of the lines before red lights, shape ``(n, 4, 2)`` [m]
-        """
-        return self._lines[np.unique(self._line_of[self.red(time)])]
+        lines, first = np.unique(self._line_of[self.closed(time)], return_index=True)
+        return StopLines(self._lines[lines], self.red(time)[self.closed(time)][first])

@@ -20,8 +20,6 @@ MEANS = (
     ("IS", 100.0, "infraction_score"),
     ("TTC", 1.0, "min_ttc"),
     ("speed", 1.0, "mean_speed"),
-    ("path", 1.0, "distance"),
-    ("curvature", 1.0, "max_curvature"),
     ("duration", 1.0, "duration"),
     ("return", 1.0, "return"),
     ("cost", 1.0, "cost"),
@@ -65,9 +63,9 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
 
     ``DS``, ``RC``, ``IS`` (0 to 100), ``success`` and ``collision_free`` (shares), ``CO`` (collisions per 100 m), ``CR``
     (collisions per km), ``IPK`` (infractions per km), ``TTC`` and ``TTC_5`` (mean and 5th percentile of the episodes'
-    smallest time to collision, s), ``speed`` (m/s), ``path`` (its length, m), ``curvature`` (the largest, 1/m),
-    ``duration`` (s), ``return``, ``cost``, ``cost_cvar`` (mean cost of the worst tenth) and ``safety`` (0 to 100: the share of
-    episodes without collision times the share of the path with more than 0.5 m to what is nearest).
+    smallest time to collision, s), ``speed`` (m/s), ``duration`` (s), ``return``, ``cost``, ``cost_cvar`` (mean cost of the
+    worst tenth). Of the course also ``path`` (its length, m), ``curvature`` (the largest, 1/m) and ``safety`` (0 to 100: the
+    share of episodes without collision times the share of the path with more than 0.5 m to what is nearest).
     ``<name>_low`` and ``<name>_high`` bound 95 % intervals: Wilson's for shares, Poisson's for events per distance,
     Student's t for means, resampling for the rest.
 
@@ -84,7 +82,7 @@ def summarise(records: Sequence[Mapping[str, float]]) -> dict[str, float]:
         *_shares(columns),
         *_rates(columns),
         *_tails(columns),
-        _safety(columns),
+        *_of_course(columns),
     ):
         figures |= {name: value, f"{name}_low": low, f"{name}_high": high}
     return figures
@@ -121,11 +119,15 @@ def _tails(columns: Columns) -> Iterator[Figure]:
         yield name, statistic(values), bootstrap_interval(values, statistic)
 
 
-def _safety(columns: Columns) -> Figure:
+def _of_course(columns: Columns) -> Iterator[Figure]:
+    if "clear_distance" not in columns:
+        return
+    for name, values in (("path", columns["distance"]), ("curvature", columns["max_curvature"])):
+        yield name, float(values.mean()), mean_interval(values)
     rows = np.stack([columns["collisions"] == 0, columns["clear_distance"], columns["distance"]], axis=-1)
+    yield "safety", _safety(rows), bootstrap_interval(rows, _safety)
 
-    def score(values: NDArray[np.floating]) -> float:
-        free, clear, metres = values.mean(0)
-        return float(100 * free * clear / max(metres, 1e-9))
 
-    return "safety", score(rows), bootstrap_interval(rows, score)
+def _safety(rows: NDArray[np.floating]) -> float:
+    free, clear, metres = rows.mean(0)
+    return float(100 * free * clear / max(metres, 1e-9))

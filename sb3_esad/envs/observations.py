@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from sb3_esad.envs.bev import BirdsEyeView, View
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.lanes import LANE_WIDTH
+from sb3_esad.envs.lights import StopLines
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.routes import Route
@@ -33,8 +34,8 @@ class Scene(Protocol):
         """Angle from the lane to the ego vehicle [rad]."""
 
     @property
-    def red_lines(self) -> Floats:
-        """Corners of the lines before red lights, shape ``(n, 4, 2)`` [m]."""
+    def stop_lines(self) -> StopLines:
+        """The lines before lights that are not green."""
 
     @property
     def remaining(self) -> float:
@@ -74,7 +75,7 @@ class ImageObservation:
         """See :meth:`Observation.observe`."""
         traffic = scene.traffic
         heading = traffic.heading[EGO] - (scene.heading_error if self._frame == "lane" else 0.0)
-        return self._bev.draw(scene.road.markings, scene.route.contains, traffic, scene.red_lines, heading)
+        return self._bev.draw(scene.road.markings, scene.route.contains, traffic, scene.stop_lines, heading)
 
 
 class EgoObservation:

@@ -60,8 +60,8 @@ class RightOfWay:
         queue = {row: way for row, way in self._queue.items() if row in places and places[row][0] == way}
         newcomers = sorted((distance, row) for row, (_, distance) in places.items() if row not in queue)
         queue |= {row: places[row][0] for _, row in newcomers}
-        inside = [row for row in queue if places[row][1] <= 0]
-        waiting = [row for row in queue if places[row][1] > 0]
+        inside = [row for row in queue if places[row][1] <= setback]
+        waiting = [row for row in queue if places[row][1] > setback]
         self._queue = {row: queue[row] for row in (*inside, *waiting)}
         traffic.stop_distance[:] = np.inf
         before: list[int] = []

@@ -39,24 +39,24 @@ class RoadUsers:
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
         self.wheel_angle = np.zeros(len(users))
-        self.has_path = np.array([bool(user.path) for user in users])
-        self.next_lane, self.towards_path, off_path = self._follow_paths(users)
+        self.next_lane, self.towards_path, self.leads_astray, off_path = self._follow_paths(users)
         self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T
         self._rows = np.arange(len(users))
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
         self.target_lane[:] = self.lane
 
-    def _follow_paths(self, users: Sequence[User]) -> tuple[Ints, Ints, Floats]:
+    def _follow_paths(self, users: Sequence[User]) -> tuple[Ints, Ints, Bools, Floats]:
         """
         Read the paths; each array of shape ``(users, lanes)``.
 
-        :return: the lane that each user takes after each lane; the one to change to from there in order to be on its path; and
-            what keeps it off lanes it will not take [m]
+        :return: the lane that each user takes after each lane; the one to change to from there in order to be on its path;
+            whether the lane is beside the path but does not lead on to where the path goes; and what keeps the user off lanes
+            that it will not take [m]
         """
         road = self.road
         following, towards = (np.tile(each, (len(users), 1)) for each in (road.following, np.arange(len(road.length))))
-        off_path = np.zeros(following.shape)
+        astray, off_path = np.zeros(following.shape, dtype=bool), np.zeros(following.shape)
         for row, user in enumerate(users):
             if user.path:
                 path, wanted = np.array(user.path[:-1], dtype=np.int64), np.array(user.path[1:], dtype=np.int64)
@@ -64,9 +64,10 @@ class RoadUsers:
                 turns = (road.following[path] == NO_LANE) | ~beside
                 following[row, path[turns]] = wanted[turns]
                 towards[row] = road.towards(user.path)
+                astray[row] = road.leads_astray(user.path)
                 off_path[row] = OFF_PATH
                 off_path[row, list(road.with_lanes_beside(user.path))] = 0.0
-        return following, towards, off_path
+        return following, towards, astray, off_path
 
     def _locate(self) -> None:
         road, count = self.road, len(self.speed)

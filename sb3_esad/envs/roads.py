@@ -1,5 +1,6 @@
 """Roads as arrays of lanes, onto which all road users are projected at once."""
 
+import itertools
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
@@ -150,6 +151,20 @@ class Road:
             for row in (self.row(lane, self.left), self.row(lane, self.right)):
                 beside[row[1:]] = row[:-1]
         return beside
+
+    def leads_astray(self, path: Sequence[int]) -> Bools:
+        """
+        Find the lanes beside a path that one must get off in time.
+
+        :param path: indices of lanes that are taken one after the other
+        :return: for every lane whether it is beside one of the path but continued to elsewhere, shape ``(lanes,)``
+        """
+        astray = np.zeros(len(self.length), dtype=bool)
+        for lane, following in itertools.pairwise(path):
+            beside = list(self.with_lanes_beside([lane]) - {lane})
+            leads_to = self.following[beside]
+            astray[beside] = (leads_to == NO_LANE) | (self.row_of[leads_to] != self.row_of[following])
+        return astray
 
     @staticmethod
     def row(lane: int, beside: Ints) -> list[int]:

@@ -22,8 +22,6 @@ class Route:
         self.contains = np.zeros(len(road.length), dtype=bool)
         self._before = np.zeros(len(road.length))
         self._stretch = np.ones(len(road.length))
-        self.back = road.towards(lanes)
-        """The lane to change to from each lane in order to get back to ``lanes``, the lane itself elsewhere."""
         metres = -start
         for lane in lanes:
             for each in road.with_lanes_beside([lane]):

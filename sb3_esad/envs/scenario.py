@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs.config import COMMON, check_config, merge_config
 from sb3_esad.envs.episode import Episode
-from sb3_esad.envs.geometry import Floats, wrap_angle
+from sb3_esad.envs.geometry import wrap_angle
 from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
+from sb3_esad.envs.lights import NO_LINES, StopLines
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
 from sb3_esad.envs.rewards import DrivingReward
 from sb3_esad.envs.road_users import EGO
@@ -41,6 +42,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     road: Road
     route: Route
     traffic: Traffic
+    episode: Episode
 
     def __init__(
         self, config: dict[str, Any] | None = None, observation: str = "image", render_mode: str | None = None
@@ -81,16 +83,15 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         """Place the ego vehicle (first) and all others on ``self.road``."""
         raise NotImplementedError
 
+    def _start_episode(self) -> Episode:
+        return Episode(self.route.length)
+
     def _before_physics(self) -> None:
         """Events of this scenario, called once per decision."""
 
     def _progress(self) -> float:
         """Position of the ego vehicle along the route [m]."""
         raise NotImplementedError
-
-    def _clearance(self) -> float:
-        """Room to what is nearest, infinite where closeness is no matter of safety [m]."""
-        return math.inf
 
     def _ran_red_light(self) -> bool:
         """Whether the ego vehicle crossed a red light's stop line in this step."""
@@ -127,9 +128,9 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return float(wrap_angle(traffic.heading[EGO] - along_lane)[0])
 
     @property
-    def red_lines(self) -> Floats:
-        """Corners of the lines before red lights, shape ``(n, 4, 2)`` [m]."""
-        return np.zeros((0, 4, 2))
+    def stop_lines(self) -> StopLines:
+        """The lines before lights that are not green."""
+        return NO_LINES
 
     @property
     def remaining(self) -> float:
@@ -150,7 +151,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.road = self._make_road()
         self.route = self._make_route()
         self.traffic = self._make_traffic()
-        self.episode = Episode(self.route.length)
+        self.episode = self._start_episode()
         self.collided = False
         self.off_road = False
         if self.render_mode == "human":
@@ -192,7 +193,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return {"is_success": success, "driving": self.episode.record(success)}
 
     def _drive(self, action: NDArray[np.floating]) -> None:
-        traffic, frequency, heading = self.traffic, self.config["physics_frequency"], float(self.traffic.heading[EGO])
+        traffic, frequency = self.traffic, self.config["physics_frequency"]
         dt, metres, duration = 1.0 / frequency, 0.0, 0.0
         self._before_physics()
         for _ in range(frequency // self.config["policy_frequency"]):
@@ -207,7 +208,6 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
                 break
         on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self._wrong_way()
         self.episode.add_motion(duration, metres, self._progress(), on_route)
-        self.episode.add_path(metres, float(traffic.heading[EGO]) - heading, self._clearance())
 
     def _check_crash(self) -> None:
         hit = users_hit(self.traffic)

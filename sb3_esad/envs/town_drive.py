@@ -6,7 +6,7 @@ import numpy as np
 
 from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lanes import LANE_WIDTH
-from sb3_esad.envs.lights import ALL_RED, GREEN, SETBACK, TrafficLights
+from sb3_esad.envs.lights import PERIOD, SETBACK, StopLines, TrafficLights
 from sb3_esad.envs.network_drive import NetworkDrive
 from sb3_esad.envs.population import Population
 from sb3_esad.envs.right_of_way import RightOfWay
@@ -120,7 +120,7 @@ class LitTown(TownDrive):
         road = super()._make_road()
         self.right_of_way = RightOfWay(self.town.crossings, LIGHTS_SEEN)
         junctions = max(way.junction for way in self.town.ways)
-        self.lights = TrafficLights(road, self.town.ways, self.np_random.uniform(0.0, 2 * (GREEN + ALL_RED), junctions))
+        self.lights = TrafficLights(road, self.town.ways, self.np_random.uniform(0.0, PERIOD, junctions))
         return road
 
     def _place_others(self, population: Population) -> list[User]:
@@ -142,19 +142,19 @@ class LitTown(TownDrive):
 
     def _before_physics(self) -> None:
         self._way = self.right_of_way.way_ahead(self.traffic, EGO)
-        self.right_of_way.regulate(self.traffic, self.lights.red(self.episode.time), SETBACK)
+        self.right_of_way.regulate(self.traffic, self.lights.closed(self.episode.time), SETBACK)
         self.walkers.walk(self.traffic, self.episode.time)
 
     def _ran_red_light(self) -> bool:
         ahead, now = self._way, self.right_of_way.way_ahead(self.traffic, EGO)
         if ahead is None or now is None or ahead[0] != now[0]:
             return False
-        return ahead[1] > SETBACK >= now[1] and bool(self.lights.forbidden(self.episode.time)[now[0]])
+        return ahead[1] > SETBACK >= now[1] and bool(self.lights.red(self.episode.time)[now[0]])
 
     @property
-    def red_lines(self) -> Floats:
-        """See :attr:`Scenario.red_lines`."""
-        return self.lights.red_lines(self.episode.time)
+    def stop_lines(self) -> StopLines:
+        """See :attr:`Scenario.stop_lines`."""
+        return self.lights.lines(self.episode.time)
 
 
 class Town03(TownDrive):

@@ -181,22 +181,27 @@ class Traffic(RoadUsers):
         pondering = rows[~changing & (self.timer[rows] > self.temper["delay"][rows])]
         if pondering.size:
             self.timer[pondering] = 0.0
-            due = self._should_be_on_path(pondering)
+            due = self.must_get_back(pondering, self.lane[pondering])
             self._ponder(pondering[~due])
             self._get_back(pondering[due])
         for row in rows[changing]:
             self._reconsider(int(row), before)
 
-    def _should_be_on_path(self, rows: Ints) -> Bools:
-        """Whether the lane that a car is on, or one beside it, is on its path and ends soon."""
-        lane = self.lane[rows]
-        left = self.road.length[lane] - self.along[lane, rows]
-        return self.has_path[rows] & (self._handicap[lane, rows] == 0) & (left < GET_BACK)
+    def must_get_back(self, rows: Ints, lanes: Ints) -> Bools:
+        """
+        Whether lanes end soon that do not lead on to where the paths of users go.
+
+        :param rows: the users, shape ``(n,)``
+        :param lanes: the lane to judge for each of them, shape ``(n,)``
+        :return: one verdict per user, shape ``(n,)``
+        """
+        left = self.road.length[lanes] - self.along[lanes, rows]
+        return np.asarray(self.leads_astray[rows, lanes] & (left < GET_BACK))
 
     def _ponder(self, rows: Ints) -> None:
         cars = np.concatenate([rows, rows])
         lanes = np.concatenate([self.road.left[self.lane[rows]], self.road.right[self.lane[rows]]])
-        possible = (lanes != NO_LANE) & self._can_change(cars, lanes)
+        possible = (lanes != NO_LANE) & self._can_change(cars, lanes) & ~self.must_get_back(cars, lanes)
         cars, lanes = cars[possible], lanes[possible]
         worth = self.change_is_worth_it(cars, lanes)
         self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
