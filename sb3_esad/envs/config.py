@@ -11,6 +11,7 @@ import numpy as np
 from sb3_esad.envs.lanes import CAR_LENGTH
 from sb3_esad.envs.users import CAR_WIDTH
 
+FRAMES = ("lane", "ego")
 COMMON: dict[str, Any] = {
     "duration": 40.0,
     "policy_frequency": 5,
@@ -73,7 +74,6 @@ RULES = (
         """
             duration route_length target_speed max_speed max_acceleration max_braking max_wheel_angle
             max_lateral_acceleration lane_tolerance graded_cost_ttc merge_length departure walking_speed
-            hall_width
         """.split(),
         _is_positive,
         "a number above 0",
@@ -94,8 +94,7 @@ RULES = (
     Rule(
         """
             start_speed headway desired_speed slow_speed fast_speed merge_start slowdown_start event_pause
-            event_braking halt_duration block_pause block_appears approach walking_pause box_side course_length
-            obstacles
+            event_braking halt_duration block_pause block_appears walking_pause
         """.split(),
         _is_range,
         "two numbers from 0 on, the smaller one first",
@@ -116,6 +115,18 @@ RULES = (
         lambda value: np.ndim(value) == 1 and len(value) > 0 and all(_is_whole(lanes, 1) for lanes in value),
         "a sequence of whole numbers from 1 on",
     ),
+    Rule(
+        ("obstacles",),
+        lambda value: _is_range(value) and all(_is_whole(number, 0) for number in value),
+        "two whole numbers from 0 on, the smaller one first",
+    ),
+    Rule(("box_side",), lambda value: _is_range(value) and value[0] > 0, "two numbers above 0, the smaller one first"),
+    Rule(("approach",), lambda value: _is_range(value) and value[1] <= 240, "two numbers from 0 to 240, ordered"),
+    Rule(("course_length",), lambda value: _is_range(value) and value[0] >= 15, "two numbers from 15 on, ordered"),
+    Rule(("hall_width",), lambda value: _is_finite(value) and value >= 4, "a number from 4 on"),
+    Rule(("graded_cost",), lambda value: isinstance(value, bool | np.bool_), "True or False"),
+    Rule(("reward_weights",), lambda value: all(map(_is_finite, value.values())), "finite weights"),
+    Rule(("frame",), lambda value: value in FRAMES, f"one of {', '.join(FRAMES)}"),
     Rule(("spawn",), lambda value: value in ("random", "fixed"), "random or fixed"),
 )
 

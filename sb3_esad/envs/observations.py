@@ -17,7 +17,6 @@ from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
 
 SPEED_SCALE, DISTANCE_SCALE, WIDTH_SCALE = 30.0, 100.0, 16.0  # [m/s], [m], [m]
-FRAMES = ("lane", "ego")
 EGO_FEATURES = ("speed", "heading_error", "lane_offset", "route_left", "room_left", "room_right")
 USER_FEATURES = ("presence", "ahead", "right", "speed_ahead", "speed_right", "cos", "sin")
 
@@ -68,8 +67,6 @@ class ImageObservation:
         self.space: spaces.Space[Any] = spaces.Box(0, 255, (3, *view.shape), np.uint8)
         self._bev = BirdsEyeView(view)
         self._frame = config["frame"]
-        if self._frame not in FRAMES:
-            raise ValueError(f"unknown frame {self._frame!r}; choose one of {', '.join(FRAMES)}")
 
     def observe(self, scene: Scene) -> NDArray[np.uint8]:
         """See :meth:`Observation.observe`."""
