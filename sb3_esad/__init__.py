@@ -3,7 +3,7 @@
 from pathlib import Path
 
 import sb3_esad.envs  # noqa: F401  (registers the scenarios)
-from sb3_esad.esad_lend import ESADLEND
+from sb3_esad.esad_lend import ADEND, ESADLEND, SADLEN
 
 __version__ = (Path(__file__).parent / "version.txt").read_text().strip()
-__all__ = ["ESADLEND", "__version__"]
+__all__ = ["ADEND", "ESADLEND", "SADLEN", "__version__"]

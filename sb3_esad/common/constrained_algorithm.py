@@ -10,11 +10,14 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedul
 
 from sb3_esad.common.callbacks import LagrangeCallback, prepend
 from sb3_esad.common.checks import require
-from sb3_esad.common.functional import barrier_residual, capped_cvar, tail_factor
+from sb3_esad.common.foresight import Foresight
+from sb3_esad.common.functional import barrier_residual, tail_factor
 from sb3_esad.common.latent_algorithm import FALLING_RATE, LatentAlgorithm
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.penalties import NoPenalty, Penalty
 from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.selection import BEST_UNIFORM, ActionFilter, NoFilter, SafetyFilter, SelectionRates
+from sb3_esad.common.type_aliases import Belief
 
 UNKNOWN_LENGTH = 1000.0
 
@@ -37,11 +40,15 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
     :param barrier_decay: alpha_b in (0, 1], how fast the risk must return to the budget; larger is less conservative
     :param barrier_steps: m, steps over which the barrier condition is taken
     :param barrier_coef: weight of a violated barrier condition; 0 drops it
+    :param filter_start: updates after which an action that is not admissible is replaced; None for never
+    :param n_candidates: latents of which the worst decide whether an action is admissible
+    :param n_proposals: actions to choose from where the actor's own is not admissible
     :param kwargs: see :class:`LatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
 
     penalty_class: ClassVar[type[Penalty]] = AugmentedLagrangian
+    filter_class: ClassVar[type[ActionFilter]] = SafetyFilter
 
     def __init__(
         self,
@@ -59,6 +66,9 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         barrier_decay: float = 0.3,
         barrier_steps: int = 2,
         barrier_coef: float = 0.0,
+        filter_start: int | None = 2000,
+        n_candidates: int = 8,
+        n_proposals: int = 16,
         _init_setup_model: bool = True,
         **kwargs: Any,
     ) -> None:
@@ -74,6 +84,9 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         self.barrier_decay = barrier_decay
         self.barrier_steps = barrier_steps
         self.barrier_coef = barrier_coef
+        self.filter_start = filter_start
+        self.n_candidates = n_candidates
+        self.n_proposals = n_proposals
         self._n_updates_penalized = 0
         if _init_setup_model:
             self._setup_model()
@@ -84,11 +97,18 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         require(0 <= self._cost_gamma < 1, "cost_gamma", self._cost_gamma, "a discount in [0, 1), also where it is gamma")
         require(0 < self.barrier_decay <= 1, "barrier_decay", self.barrier_decay, "a rate in (0, 1]")
         require(self.barrier_steps >= 1, "barrier_steps", self.barrier_steps, "a number of steps >= 1")
+        start = self.filter_start
+        require(start is None or start >= 0, "filter_start", start, "a number of updates >= 0, or None for no filter")
+        require(self.n_candidates >= 1, "n_candidates", self.n_candidates, "a number of latents >= 1")
+        fewest = BEST_UNIFORM + 2
+        require(self.n_proposals >= fewest, "n_proposals", self.n_proposals, f"a number of actions >= {fewest}")
 
     def _setup_model(self) -> None:
         super()._setup_model()
         self.penalty = self._make_penalty().to(self.device)
+        self.policy.action_filter = self._make_filter()
         self._violations: list[th.Tensor] = []
+        self._selections = SelectionRates()
 
     def _make_penalty(self) -> Penalty:
         penalty_class = NoPenalty if self.cost_limit is None else self.penalty_class
@@ -104,6 +124,21 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
             penalty_coef=self.penalty_coef,
             penalty_warmup=self.penalty_warmup,
         )
+
+    def _make_filter(self) -> ActionFilter:
+        filter_class = NoFilter if self.cost_limit is None or self.filter_start is None else self.filter_class
+        return filter_class(
+            penalty=self.penalty,
+            is_active=self._filter_is_active,
+            foresight=Foresight(self.barrier_steps, self.gamma, self._cost_gamma, self.risk_level, self.barrier_decay),
+            risk_level=self.risk_level,
+            n_candidates=self.n_candidates,
+            n_proposals=self.n_proposals,
+        )
+
+    def _filter_is_active(self) -> bool:
+        assert self.filter_start is not None
+        return self._n_updates >= self.filter_start and self.penalty.calibrated
 
     def _episode_length(self) -> float:
         """Longest episode the environment admits, until episodes have been seen."""
@@ -141,13 +176,25 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
             self._note_risk()
         return sampled
 
+    def _select(self, belief: Belief, proposed: th.Tensor) -> th.Tensor:
+        selection = self.policy.action_filter.select(self.policy.learner, belief, proposed)
+        self._selections.note(selection)
+        return selection.actions
+
+    def dump_logs(self) -> None:
+        """Write the log, rates of the filter included."""
+        for name, value in self._selections.take().items():
+            self.logger.record(f"rollout/{name}", value)
+        super().dump_logs()
+
     @th.no_grad()
     def _note_risk(self) -> None:
         """Note what the critics expect where the policy really is: replayed states are those of policies that are gone."""
         assert self._last_latent is not None
         grids, actions = self.policy.world_model.features(self._last_latent), self._last_latent.action
         means, variance = self.policy.cost_critic_target(grids, actions)
-        self._violations.append(self._risk(means, variance).mean() - self.penalty.budget)
+        risk = self.policy.cost_critic_target.risk(means, variance, self.risk_level)
+        self._violations.append(risk.mean() - self.penalty.budget)
         self.penalty.note_prediction(means.mean(0))
 
     def risk(self, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
@@ -158,10 +205,8 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         :param actions: their actions, of shape (N, A)
         :return: shape (N,)
         """
-        return self._risk(*self.policy.cost_critic_target(grids, actions))
-
-    def _risk(self, means: th.Tensor, variance: th.Tensor) -> th.Tensor:
-        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic_target.bound).max(0).values
+        means, variance = self.policy.cost_critic_target(grids, actions)
+        return self.policy.cost_critic_target.risk(means, variance, self.risk_level)
 
     def _barrier(self, risk: th.Tensor) -> th.Tensor:
         """Residual at each imagined step, of shape (H, N); the last m steps look too far ahead and count as safe."""
@@ -175,4 +220,4 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         return [*names, "penalty"], variables
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "penalty", "_violations"]
+        return [*super()._excluded_save_params(), "penalty", "_violations", "_selections"]

@@ -199,14 +199,15 @@ class WorldModel(LearningModule):
         targets = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
         weights = samples.event_weights.expand_as(steps).flatten()
         prediction_loss, logs = self.predictions.loss(grid, targets, weights)
-        kl_loss, kl_logs = self.rssm.head.loss(filtered.posterior, filtered.prior, filtered.states.memory, filtered.embeddings)
         # Decoding is the dearest part, and half of the frames say as much about the other half
         some = th.randperm(len(grid), device=grid.device, generator=generator)[: (len(grid) + 1) // 2]
+        distributions = (filtered.posterior, filtered.prior)
+        head_loss, head_logs = self.rssm.head.loss(*distributions, filtered.states.memory, filtered.embeddings, generator)
         seen = self._preprocess(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)[some]))
         observation_losses = [head.loss(grid[some], _by_key(seen)[key]) for key, head in self._observation_heads()]
         observation_loss = th.stack(observation_losses).sum()
-        loss = observation_loss + prediction_loss + kl_loss
-        return loss, filtered, {**logs, **kl_logs, "observation_loss": observation_loss.item()}
+        loss = observation_loss + prediction_loss + head_loss
+        return loss, filtered, {**logs, **head_logs, "observation_loss": observation_loss.item()}
 
     def _withhold(self, steps: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         # Every window hides one stretch, so that the prior is trained on what it will be used for: going on alone

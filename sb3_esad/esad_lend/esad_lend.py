@@ -1,28 +1,28 @@
 """ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.constrained_algorithm import ConstrainedLatentAlgorithm
 from sb3_esad.common.entropy import make_entropy_coefficient
 from sb3_esad.common.functional import capped_cvar
+from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns, taken
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
+from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
     Transitions,
     cost_targets,
-    imagined_costs,
-    imagined_returns,
     recorded_cost_targets,
     recorded_return_targets,
     recorded_transitions,
-    taken,
 )
 
 
@@ -48,6 +48,12 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
 
     def __init__(
         self,
