@@ -27,8 +27,9 @@ LAYERS = [
     "common.recurrent_algorithm common.latent_algorithm common.constrained_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",
     "",  # the package itself, which re-exports
-    "driving_evaluation report dream panels progress hyperparams",
-    "video plots",
+    "driving_evaluation report dream explanation panels progress hyperparams",
+    "moments plots",
+    "video",
     "demo zoo benchmark",
     "__main__",
 ]

@@ -94,7 +94,9 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         tail_factor(self.risk_level)  # refuses a level outside (0, 1], with and without a limit
-        require(0 <= self._cost_gamma < 1, "cost_gamma", self._cost_gamma, "a discount in [0, 1), also where it is gamma")
+        require(
+            0 <= self.discount_of_cost < 1, "cost_gamma", self.discount_of_cost, "a discount in [0, 1), also where it is gamma"
+        )
         require(0 < self.barrier_decay <= 1, "barrier_decay", self.barrier_decay, "a rate in (0, 1]")
         require(self.barrier_steps >= 1, "barrier_steps", self.barrier_steps, "a number of steps >= 1")
         start = self.filter_start
@@ -115,7 +117,7 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         return penalty_class(
             cost_limit=self.cost_limit,
             risk_level=self.risk_level,
-            cost_gamma=self._cost_gamma,
+            cost_gamma=self.discount_of_cost,
             episode_length=self._episode_length(),
             barrier_coef=self.barrier_coef,
             lambda_lr=self.lambda_lr,
@@ -130,7 +132,7 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         return filter_class(
             penalty=self.penalty,
             is_active=self._filter_is_active,
-            foresight=Foresight(self.barrier_steps, self.gamma, self._cost_gamma, self.risk_level, self.barrier_decay),
+            foresight=Foresight(self.barrier_steps, self.gamma, self.discount_of_cost, self.risk_level, self.barrier_decay),
             risk_level=self.risk_level,
             n_candidates=self.n_candidates,
             n_proposals=self.n_proposals,
@@ -150,7 +152,8 @@ class ConstrainedLatentAlgorithm(LatentAlgorithm):
         return UNKNOWN_LENGTH
 
     @property
-    def _cost_gamma(self) -> float:
+    def discount_of_cost(self) -> float:
+        """``cost_gamma``, or ``gamma`` where it is None."""
         return self.gamma if self.cost_gamma is None else self.cost_gamma
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:

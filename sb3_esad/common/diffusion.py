@@ -8,7 +8,6 @@ import torch as th
 from sb3_esad.common.checks import require
 from sb3_esad.common.denoiser import Denoiser
 from sb3_esad.common.latents import Gaussian, GaussianHead
-from sb3_esad.common.target_networks import make_target, update_target
 from sb3_esad.common.torch_layers import GridShape
 from sb3_esad.common.type_aliases import Logs
 
@@ -84,7 +83,6 @@ class DiffusionHead(GaussianHead):
         self.start_level = start_level
         with th.random.fork_rng(devices=[]):  # so that all other networks begin as they would without a denoiser
             self.denoiser = Denoiser(memory_shape, hidden_channels, latent_channels, hidden_channels)
-        self.denoiser_target = make_target(self.denoiser)
         self.register_buffer("residual_scale", th.tensor(0.1))
         self.register_buffer("posterior_std", th.ones(latent_channels, *memory_shape[1:]))
         self.register_buffer("advantage", th.tensor(-1.0))
@@ -104,7 +102,7 @@ class DiffusionHead(GaussianHead):
         if not self.refines:
             return super().sample(memory, embedding, n_candidates, generator)
         prior = self.prior(memory)
-        context = self.denoiser_target.context(memory, embedding)
+        context = self.denoiser.context(memory, embedding)
         start = self.residual_scale * (self.start_level if embedding is None else 1.0)
         centre, variance = th.zeros_like(prior.mean), (prior.std.square() - self.posterior_std.square()).clamp(min=0)
         if embedding is not None:
@@ -117,7 +115,7 @@ class DiffusionHead(GaussianHead):
         """Euler's steps from one noise level to the next; the last one ends at the spread of the posterior."""
         levels = noise_levels(start, self.diffusion_steps)
         for level, following in zip(levels, [*levels[1:], self.posterior_std], strict=True):
-            clean = self.denoiser_target(noisy, level.expand(len(noisy)), self.residual_scale, context)
+            clean = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
             end = th.minimum(following, level)
             noisy = clean + end / level * (noisy - clean)
         missing = (self.posterior_std.square() - end.square()).sqrt()  # where latents are vaguer than where the sample began
@@ -139,7 +137,6 @@ class DiffusionHead(GaussianHead):
         residual = posterior.mean - prior.mean
         self._follow(posterior, residual)
         self._judge(prior, residual, memory, generator)
-        update_target(self.denoiser, self.denoiser_target, 1 - MEMORY)
         diffusion = self._denoising_loss(residual, memory, embedding, generator)
         scales = {"residual_scale": self.residual_scale.item(), "diffusion_advantage": self.advantage.item()}
         return loss + diffusion, {**logs, "diffusion_loss": diffusion.item(), **scales}
@@ -169,8 +166,8 @@ class DiffusionHead(GaussianHead):
         """Compare the denoiser with the Gaussian's own where samples start, on states that it has not been fitted to yet."""
         level = self.residual_scale * self.start_level
         noisy = Gaussian(residual, level.expand_as(residual)).sample(generator)
-        context = self.denoiser_target.context(memory, None)
-        learned = self.denoiser_target(noisy, level.expand(len(noisy)), self.residual_scale, context)
+        context = self.denoiser.context(memory, None)
+        learned = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
         variance = (prior.std.square() - self.posterior_std.square()).clamp(min=0)
         assumed = gaussian_denoiser(noisy, level, variance)
         errors = [(estimate - residual).square().mean() for estimate in (learned, assumed)]

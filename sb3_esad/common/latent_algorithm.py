@@ -190,7 +190,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _differentiate(self, name: str, loss: th.Tensor) -> None:
         network = getattr(self.policy, name)
         network.optimizer.zero_grad()
-        loss.backward(inputs=[parameter for parameter in network.parameters() if parameter.requires_grad])
+        loss.backward(inputs=list(network.parameters()))
 
     def _move(self, name: str) -> float:
         """Move a network against its gradient, and its target after it."""

@@ -20,7 +20,7 @@ from sb3_esad.common.latents import GaussianHead, LatentHead
 from sb3_esad.common.noise import fixed_seed
 from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.rssm import RSSM
-from sb3_esad.common.selection import ActionFilter, NoFilter
+from sb3_esad.common.selection import ActionFilter, NoFilter, Selection
 from sb3_esad.common.target_networks import make_target
 from sb3_esad.common.type_aliases import Belief, LatentState
 from sb3_esad.common.world_model import WorldModel
@@ -192,7 +192,8 @@ class LatentPolicy(BasePolicy):
                 f"predict() was given {n_envs} observation(s) with {len(start)} values of episode_start: {remedy}."
             )
         starts = th.as_tensor(start, device=self.device)
-        belief, actions = self._decide(tensor, self._from_numpy(state, n_envs), starts, deterministic)
+        belief, selection = self.decide(tensor, self._from_numpy(state, n_envs), starts, deterministic)
+        actions = selection.actions
         new_state = tuple(field.flatten(1)[None].cpu().numpy() for field in belief.state._replace(action=actions))
         unscaled = self.unscale_action(actions.cpu().numpy().reshape(-1, *self.action_space.shape))
         unscaled = unscaled.astype(self.action_space.dtype, copy=False)
@@ -201,16 +202,24 @@ class LatentPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
         start = th.ones(n, dtype=th.bool, device=self.device)
-        return self._decide(observation, self.initial_state(n), start, deterministic)[1]
+        return self.decide(observation, self.initial_state(n), start, deterministic)[1].actions
 
-    def _decide(
+    def decide(
         self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool
-    ) -> tuple[Belief, th.Tensor]:
-        """Take in an observation and choose the action to execute, with the same noise each time if deterministic."""
+    ) -> tuple[Belief, Selection]:
+        """
+        Take in an observation and choose the action to execute.
+
+        :param observation: of shape (N, ...)
+        :param state: the previous state and the executed action
+        :param episode_start: bool, of shape (N,)
+        :param deterministic: take means instead of samples, and the same noise each time where the filter needs some
+        :return: what is known now, and what shall be executed
+        """
         belief = self.average.observe(observation, state, episode_start, deterministic)
         proposed = self.average.act(belief.state, deterministic)
         with fixed_seed(self.device) if deterministic else nullcontext():
-            return belief, self.action_filter.select(self.average, belief, proposed).actions
+            return belief, self.action_filter.select(self.average, belief, proposed)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """

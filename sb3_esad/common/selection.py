@@ -61,6 +61,21 @@ class SelectionRates:
         return {name: th.cat(flags).float().mean().item() for name, flags in rates.items()}
 
 
+def draw_scenarios(agent: LatentAgent, belief: Belief, n: int) -> LatentState:
+    """
+    Draw what may be the case: latents of the same memory.
+
+    :param agent: whose world model draws
+    :param belief: N states and their observations
+    :param n: M, how many for each state, the latent of the state itself first
+    :return: fields of shape (M, N, ...)
+    """
+    state = belief.state
+    others = agent.world_model.rssm.head.sample(state.memory, belief.embedding, n - 1) if n > 1 else state.latent[:0]
+    latents = th.cat([state.latent, others]).unflatten(0, (n, -1))
+    return LatentState(state.memory.expand(n, *state.memory.shape), latents, state.action.expand(n, *state.action.shape))
+
+
 class ActionFilter(ABC):
     """
     Last word on the action to execute.
@@ -134,7 +149,7 @@ class SafetyFilter(ActionFilter):
         if not self.is_active():
             return NoFilter().select(agent, belief, proposed)
         with autocast(proposed.device):
-            scenarios = self._scenarios(agent, belief)
+            scenarios = draw_scenarios(agent, belief, self.n_candidates)
             doubtful = ~self._admissible(self.assess(agent, scenarios, proposed[None]))[0]
             actions, helpless = proposed.clone(), th.zeros_like(doubtful)
             if doubtful.any():
@@ -161,15 +176,6 @@ class SafetyFilter(ActionFilter):
         n_worst = math.ceil(self.risk_level * n_scenarios)
         worst, following = (each.topk(n_worst, dim=1).values.mean(1) for each in (risks, next_risks))
         return Outlook(values.mean(1), worst, following)
-
-    def _scenarios(self, agent: LatentAgent, belief: Belief) -> LatentState:
-        """Latents of the same memory, the one that the actor acted on first."""
-        state, n = belief.state, self.n_candidates - 1
-        others = agent.world_model.rssm.head.sample(state.memory, belief.embedding, n) if n else state.latent[:0]
-        latents = th.cat([state.latent, others]).unflatten(0, (self.n_candidates, -1))
-        copies = (field.expand(self.n_candidates, *field.shape) for field in (state.memory, state.action))
-        memory, action = copies
-        return LatentState(memory, latents, action)
 
     def _admissible(self, outlook: Outlook) -> th.Tensor:
         return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget))

@@ -183,7 +183,16 @@ class WorldModel(LearningModule):
         :param states: N states
         :return: preprocessed observations by key, of shape (N, ...); the key of a single observation is "observation"
         """
-        return {key: head(self.features(states)) for key, head in self._observation_heads()}
+        return self.decode(self.features(states))
+
+    def decode(self, grids: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        Show what features of states look like.
+
+        :param grids: features, of shape (N, C, H, W)
+        :return: see :meth:`reconstruct`
+        """
+        return {key: head(grids) for key, head in self._observation_heads()}
 
     def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, Logs]:
         """

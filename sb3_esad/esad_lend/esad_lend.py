@@ -128,9 +128,9 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
         if continue_after_cost > 0:
             for each in (critic, target):
-                each.raise_bound(1 / (1 - self._cost_gamma))
-        targets = cost_targets(target, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(target, recorded, self._cost_gamma)
+                each.raise_bound(1 / (1 - self.discount_of_cost))
+        targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
+        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost)
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
@@ -175,7 +175,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
         from it to crash less often ("blindness to success", arXiv 2205.05138): hence without the bound.
         """
-        costs = imagined_costs(self.policy.cost_critic, imagined, self._cost_gamma, self.lambda_return)
+        costs = imagined_costs(self.policy.cost_critic, imagined, self.discount_of_cost, self.lambda_return)
         _, variance = self.policy.cost_critic(*taken(imagined))
         return capped_cvar(costs, variance.view_as(costs), self.risk_level, math.inf)
 
