@@ -84,8 +84,8 @@ class ExplainedDriver:
                 start, partial(agent.actor, deterministic=True), self.horizon, self.model.gamma
             )
             costs = imagined_costs(agent.cost_critic, imagined, self.model.discount_of_cost, lambda_=1.0)[0]
-            order = costs.argsort(descending=True)
-            return Futures(agent.world_model.decode(imagined.grids[-1][order]), costs[order])
+        order = costs.argsort(descending=True)
+        return Futures(agent.world_model.decode(imagined.grids[-1][order].float()), costs[order])
 
     def tail(self, futures: Futures) -> float:
         """

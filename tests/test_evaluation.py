@@ -19,11 +19,12 @@ from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.dream import DreamingDriver
 from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluate_model, stack_frames
 from sb3_esad.envs.metrics import DrivingMetrics
-from sb3_esad.panels import PANEL, SIZE, Gauge, compose, paint
+from sb3_esad.explanation import ExplainedDriver
+from sb3_esad.panels import HEIGHT, PANEL, ROW, WIDTH, Gauge, compose, paint
 from sb3_esad.plots import plot_learning_curve
 from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar, TrainingEpisode
 from sb3_esad.report import format_table, summarise_any
-from sb3_esad.video import record_driver, record_model, write_video
+from sb3_esad.video import record_driver, record_explanation, record_model, write_video
 
 SEEDS = [5, 0, 12, 7, 3, 9, 1, 30]
 TINY = {"net_arch": [8], "memory_channels": 4, "latent_channels": 2}
@@ -229,7 +230,7 @@ def test_compose_has_the_size_of_a_video_frame() -> None:
     picture = compose(
         scene, {"seen": np.full((64, 64, 3), 200, np.uint8)}, [Gauge("risk", "1 %", 2.0, 0.5, (255, 0, 0))], "Arrived"
     )
-    assert picture.shape == (SIZE[1], SIZE[0], 3)
+    assert picture.shape == (HEIGHT + ROW, WIDTH, 3)
     assert (picture == 200).all(-1).sum() == PANEL[0] * PANEL[1]
 
 
@@ -249,9 +250,30 @@ def test_record_model(policy: str, tmp_path: Path) -> None:
     n_frames, shape, code = read_video(tmp_path / "episode.mp4")
     steps = int(evaluate_model(model, env_id, [3])[0]["steps"])
     assert steps < n_frames <= steps + 10
-    assert shape == (SIZE[1], SIZE[0], 3)
+    assert shape == (HEIGHT + ROW, WIDTH, 3)
     assert code in ("h264", "avc1")
     assert [path.name for path in tmp_path.iterdir()] == ["episode.mp4"]
+
+
+def test_what_is_explained_is_what_is_done(model: ESADLEND) -> None:
+    env = gym.make("short-image-v0")
+    driver, memory = ExplainedDriver(model, n_futures=5, horizon=3), None
+    for step in range(4):
+        observation, _ = env.reset(seed=step)
+        action = driver(observation)
+        expected, memory = model.predict(observation, state=memory, deterministic=True)
+        np.testing.assert_allclose(action, expected, rtol=1e-6)
+    futures = driver.futures()
+    assert th.equal(futures.costs, futures.costs.sort(descending=True).values)
+    assert futures.images["observation"].shape == (5, 3, 64, 64)
+    assert driver.tail(futures) == pytest.approx(futures.costs[:3].mean().item())  # of 5 the worst half
+    th.testing.assert_close(driver.futures().costs, futures.costs, msg="the same moment is explained by the same futures")
+
+
+def test_record_explanation(model: ESADLEND, tmp_path: Path) -> None:
+    record_explanation(tmp_path / "why.mp4", model, "short-image-v0", seed=3)
+    n_frames, shape, _ = read_video(tmp_path / "why.mp4")
+    assert n_frames > 10 and shape == (HEIGHT + 2 * ROW, WIDTH, 3)
 
 
 def test_record_driver(tmp_path: Path) -> None:
