@@ -12,12 +12,12 @@ import pytest
 import torch as th
 from conftest import CountingEnv
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from sb3_esad import ESADLEND
+from sb3_esad import ESADLEND, WCSAC
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.dream import DreamingDriver
-from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluate_model
+from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluate_model, stack_frames
 from sb3_esad.envs.metrics import DrivingMetrics
 from sb3_esad.explanation import ExplainedDriver
 from sb3_esad.panels import HEIGHT, PANEL, ROW, WIDTH, Gauge, compose, paint
@@ -79,6 +79,25 @@ def test_every_seed_is_played_once_and_to_its_end(n_envs: int) -> None:
     assert [record["steps"] for record in records] == [seed + 1 for seed in SEEDS]
     assert [record["return"] for record in records] == [sum(range(1, seed + 2)) for seed in SEEDS]
     assert [record["cost"] for record in records] == [(seed + 1) // 3 for seed in SEEDS]
+
+
+def test_frames_are_stacked_as_the_model_was_shown_them() -> None:
+    env = VecFrameStack(DummyVecEnv([lambda: gym.make(ENV_IDS["CnnPolicy"])]), 4)
+    model = WCSAC("CnnPolicy", env, buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu")
+    assert model.observation_space.shape == (12, 64, 64)
+    records = evaluate_model(model, ENV_IDS["CnnPolicy"], [3, 1])
+    assert [record["seed"] for record in records] == [3, 1] and all(record["steps"] > 0 for record in records)
+
+
+def test_only_what_becomes_the_wanted_space_is_stacked() -> None:
+    env = DummyVecEnv([CountingEnv])
+    three = gym.spaces.Box(0.0, 1e6, (3,), np.float32)
+    stacked = stack_frames(env, three)
+    stacked.reset()
+    shown = [stacked.step(np.zeros((1, 1)))[0].tolist() for _ in range(2)]  # type: ignore[union-attr]
+    assert stacked.observation_space == three and shown == [[[0, 0, 1]], [[0, 1, 2]]]
+    for other in (env.observation_space, gym.spaces.Box(0.0, 1.0, (3,), np.float32)):
+        assert stack_frames(env, other) is env
 
 
 def test_finished_episodes_stand_still() -> None:

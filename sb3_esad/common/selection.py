@@ -125,8 +125,8 @@ class SafetyFilter(ActionFilter):
     :param foresight: imagines where an action leads
     :param risk_level: fraction of the worst scenarios that counts
     :param n_candidates: scenarios
-    :param n_proposals: samples of the actor, and as many uniform actions, that the critics sift where the actor's own action is
-        not admissible
+    :param n_proposals: samples of the actor, and as many uniform actions, that the critics sift where the actor's own action
+        is not admissible
     """
 
     def __init__(

@@ -124,11 +124,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         }
 
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        continue_after_cost = self.replay_buffer.continue_after_cost
+        continue_after_cost = self._raise_cost_bound()
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
-        if continue_after_cost > 0:
-            for each in (critic, target):
-                each.raise_bound(1 / (1 - self.discount_of_cost))
         targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
         anchors = recorded_cost_targets(target, recorded, self.discount_of_cost)
         weights = imagined.weights.flatten()
