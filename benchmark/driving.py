@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_esad import ESADLEND
+from sb3_esad import ESADLEND, WCSAC, SACLag
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.hyperparams import load_hyperparams
@@ -30,16 +30,18 @@ UNSEEN = 2_000_000
 """First seed of the evaluation; tune on others (--unseen)."""
 
 
-def esad_lend(seed: int, changes: dict[str, Any]) -> ESADLEND:
+def tuned(algorithm: type[OffPolicyAlgorithm], name: str, seed: int, changes: dict[str, Any]) -> OffPolicyAlgorithm:
     """
-    Build ESAD-LEND with the scenario's hyperparameters.
+    Build an algorithm of this package with the scenario's hyperparameters.
 
+    :param algorithm: its class
+    :param name: of its hyperparameters
     :param seed: of the training
     :param changes: arguments of the constructor to replace
     :return: the algorithm
     """
-    hyperparams = load_hyperparams(ESADLEND, "esad_lend", ENV)
-    return ESADLEND(env=make_vec_env(ENV, hyperparams.n_envs), seed=seed, **{**hyperparams.arguments, **changes})
+    hyperparams = load_hyperparams(algorithm, name, ENV)
+    return algorithm(env=hyperparams.make_env(ENV), seed=seed, **{**hyperparams.arguments, **changes})
 
 
 class CostInReward(gym.Wrapper[Any, Any, Any, Any]):
@@ -79,7 +81,12 @@ def sac(seed: int, changes: dict[str, Any]) -> SAC:
     return SAC("CnnPolicy", make_vec_env(ENV, wrapper_class=partial(CostInReward, penalty=penalty)), seed=seed, **arguments)
 
 
-ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {"esad_lend": esad_lend, "sac": sac}
+ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {
+    "esad_lend": partial(tuned, ESADLEND, "esad_lend"),
+    "wcsac": partial(tuned, WCSAC, "wcsac"),
+    "sac_lag": partial(tuned, SACLag, "sac_lag"),
+    "sac": sac,
+}
 
 
 class LearningCurve(BaseCallback):

@@ -7,8 +7,10 @@ from typing import Any
 
 import gymnasium as gym
 import numpy as np
+from gymnasium import spaces
 from stable_baselines3.common.base_class import BaseAlgorithm
-from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
+from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 
 from sb3_esad.common.costs import CostReader
 from sb3_esad.envs.drivers import DRIVERS
@@ -83,7 +85,8 @@ def evaluate_model(
 
     Environment k plays every ``n_envs``-th seed from the k-th on; that short episodes end first makes no difference.
 
-    :param model: recurrent or not; observations are normalised as its ``VecNormalize`` does, if its environment is one
+    :param model: recurrent or not; observations are normalised as its ``VecNormalize`` does, if its environment is one, and
+        stacked if it was shown stacked frames
     :param env_id: environment
     :param seeds: of the episodes
     :param deterministic: take the best action, not a sampled one
@@ -97,7 +100,7 @@ def evaluate_model(
     cost_key = getattr(model, "cost_key", "cost")
     dummy_env = DummyVecEnv([partial(_make, env_id, seeds[first::n_envs], cost_key) for first in range(n_envs)])
     envs: list[Any] = dummy_env.envs
-    vec_env = BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False)
+    vec_env = stack_frames(BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False), model.observation_space)
     check_spaces(model, vec_env, env_id)
     normalization = model.get_vec_normalize_env()
     observations, state, starts = vec_env.reset(), None, np.ones(n_envs, dtype=bool)
@@ -107,6 +110,19 @@ def evaluate_model(
         observations, _, starts, _ = vec_env.step(actions)
     vec_env.close()
     return [envs[index % n_envs].records[index // n_envs] for index in range(len(seeds))]
+
+
+def stack_frames(env: VecEnv, space: spaces.Space) -> VecEnv:
+    """
+    Show as many frames at once as a space holds.
+
+    :param env: environments
+    :param space: of the observations wanted
+    :return: the environments, which show stacked frames if that gives the space
+    """
+    n_frames = get_flattened_obs_dim(space) // get_flattened_obs_dim(env.observation_space)
+    stacked = VecFrameStack(env, n_frames) if n_frames > 1 else env
+    return stacked if stacked.observation_space == space else env
 
 
 def evaluate_driver(name: str, env_id: str, seeds: Sequence[int]) -> list[Record]:

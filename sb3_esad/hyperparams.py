@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 
 import yaml
 from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.utils import LinearSchedule
+from stable_baselines3.common.vec_env import VecEnv, VecFrameStack
 
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
 
-RUN_KEYS = ("n_timesteps", "n_envs")
+RUN_KEYS = ("n_timesteps", "n_envs", "frame_stack")
 """Keys of RL Zoo that concern the training and not the algorithm."""
 
 NAMED = (Parameter.POSITIONAL_OR_KEYWORD, Parameter.KEYWORD_ONLY)
@@ -26,11 +28,24 @@ class Hyperparams(NamedTuple):
     :param n_timesteps: environment steps
     :param n_envs: environments side by side
     :param arguments: of the algorithm's constructor
+    :param frame_stack: frames shown at once
     """
 
     n_timesteps: int
     n_envs: int
     arguments: dict[str, Any]
+    frame_stack: int = 1
+
+    def make_env(self, env_id: str, **kwargs: Any) -> VecEnv:
+        """
+        Build the environments of the training.
+
+        :param env_id: environment
+        :param kwargs: see SB3's ``make_vec_env``
+        :return: the environments, their frames stacked if need be
+        """
+        env = make_vec_env(env_id, self.n_envs, **kwargs)
+        return VecFrameStack(env, self.frame_stack) if self.frame_stack > 1 else env
 
 
 def load_hyperparams(algorithm: type[BaseAlgorithm], name: str, env_id: str) -> Hyperparams:
@@ -52,7 +67,12 @@ def load_hyperparams(algorithm: type[BaseAlgorithm], name: str, env_id: str) -> 
     check_keys(algorithm, arguments, path)
     if "learning_rate" in arguments:
         arguments["learning_rate"] = read_rate(arguments["learning_rate"], path)
-    return Hyperparams(int(entry.get("n_timesteps", 100_000)), int(entry.get("n_envs", 1)), arguments)
+    return Hyperparams(
+        n_timesteps=int(entry.get("n_timesteps", 100_000)),
+        n_envs=int(entry.get("n_envs", 1)),
+        arguments=arguments,
+        frame_stack=int(entry.get("frame_stack", 1)),
+    )
 
 
 def hyperparams_folder() -> Path:
@@ -130,7 +150,7 @@ def constructor_arguments(algorithm: type[BaseAlgorithm]) -> set[str]:
     :return: their names, without ``env`` and private ones
     """
     names: set[str] = set()
-    for each in algorithm.__mro__:
+    for each in (each for each in algorithm.__mro__ if "__init__" in vars(each)):
         parameters = inspect.signature(each).parameters.values()
         names |= {parameter.name for parameter in parameters if parameter.kind in NAMED}
         passes_on = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters)

@@ -5,11 +5,11 @@ from typing import Any, cast
 import pytest
 import torch as th
 
-from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, QEnsemble
+from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, CostTargets, QEnsemble
 from sb3_esad.common.target_networks import make_target, update_target
+from sb3_esad.common.torch_layers import GridReadout
 from sb3_esad.common.type_aliases import Imagination, Predictions
 from sb3_esad.esad_lend.targets import (
-    CostTargets,
     Transitions,
     cost_targets,
     imagined_costs,
@@ -45,7 +45,7 @@ def hazard_record(hazard: float, n: int) -> Transitions:
 
 
 def make_cost_critic(bound: float = 1.0) -> CostCritic:
-    critic = CostCritic(SHAPE, 1, [8])
+    critic = CostCritic(GridReadout(SHAPE, 8), 1, [8])
     critic.raise_bound(bound)
     return critic
 
@@ -120,7 +120,7 @@ def test_decisions_fear_the_larger_estimate() -> None:
 
 
 def make_critic() -> QEnsemble:
-    critic = QEnsemble(SHAPE, 1, [8])
+    critic = QEnsemble(GridReadout(SHAPE, 8), 1, [8])
     for network in critic.q_networks:
         th.nn.init.normal_(cast(Any, network)[-1].weight, std=0.3)
     return critic
@@ -152,7 +152,7 @@ def test_targets_have_no_gradient() -> None:
 
 
 def test_targets_are_averages_whose_buffers_are_up_to_date() -> None:
-    critic = CostCritic(SHAPE, 1, [8])
+    critic = CostCritic(GridReadout(SHAPE, 8), 1, [8])
     target = make_target(critic)
     bias = target.means[0][-1].bias
     assert bias.item() == -4.0
@@ -173,7 +173,7 @@ def test_counters_of_a_network_are_copied() -> None:
 
 
 def test_target_networks_are_frozen_copies() -> None:
-    critic = CostCritic(SHAPE, 1, [8])
+    critic = CostCritic(GridReadout(SHAPE, 8), 1, [8])
     target = make_target(critic)
     assert not target.training and not any(parameter.requires_grad for parameter in target.parameters())
     before = target(*state_and_action())
@@ -185,9 +185,9 @@ def test_target_networks_are_frozen_copies() -> None:
 
 
 def test_cost_critic_starts_near_zero_and_is_never_certain() -> None:
-    means, variance = CostCritic(SHAPE, 1, [8])(*state_and_action())
+    means, variance = CostCritic(GridReadout(SHAPE, 8), 1, [8])(*state_and_action())
     assert (means < 0.05).all() and MIN_VARIANCE < variance < 0.05
-    critic = CostCritic(SHAPE, 1, [8])
+    critic = CostCritic(GridReadout(SHAPE, 8), 1, [8])
     for parameter in critic.parameters():
         th.nn.init.constant_(parameter, -100.0)
     means, variance = critic(*state_and_action())
@@ -197,7 +197,7 @@ def test_cost_critic_starts_near_zero_and_is_never_certain() -> None:
 
 
 def test_raised_bound_keeps_small_estimates() -> None:
-    critic = CostCritic(SHAPE, 1, [8])
+    critic = CostCritic(GridReadout(SHAPE, 8), 1, [8])
     before, variance_before = critic(*state_and_action())
     critic.raise_bound(33.0)
     after, variance_after = critic(*state_and_action())
@@ -211,7 +211,7 @@ def test_raised_bound_keeps_small_estimates() -> None:
 
 
 def test_mean_stays_within_its_bound() -> None:
-    critic = CostCritic(SHAPE, 1, [8])
+    critic = CostCritic(GridReadout(SHAPE, 8), 1, [8])
     critic.raise_bound(4.0)
     means, _ = critic(th.full((1, *SHAPE), 1e6), th.full((1, 1), 1e6))
     assert ((means >= 0) & (means <= 4.0)).all()
@@ -221,7 +221,7 @@ def test_mean_stays_within_its_bound() -> None:
 
 
 def test_reward_critics_decode_what_they_were_fitted_to() -> None:
-    critic = QEnsemble((2, 1, 1), 1, [16])
+    critic = QEnsemble(GridReadout((2, 1, 1), 16), 1, [16])
     grids, actions = th.randn(6, 2, 1, 1), th.randn(6, 1)
     targets = th.tensor([-50.0, -2.0, 0.0, 0.5, 7.0, 400.0])
     assert critic(grids, actions).abs().max() < 1e-3, "untrained critics expect nothing"
@@ -236,7 +236,7 @@ def test_reward_critics_decode_what_they_were_fitted_to() -> None:
 
 
 def test_return_scale_is_the_spread_but_never_below_one() -> None:
-    critic = QEnsemble(SHAPE, 1, [8])
+    critic = QEnsemble(GridReadout(SHAPE, 8), 1, [8])
     returns = th.arange(101.0).view(1, 101)
     for _ in range(800):
         critic.follow_scale(returns)

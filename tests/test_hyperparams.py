@@ -11,10 +11,10 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_esad import ESADLEND, hyperparams
+from sb3_esad import ESADLEND, WCSAC, SACLag, hyperparams
 from sb3_esad.hyperparams import RUN_KEYS, check_keys, constructor_arguments, load_hyperparams, read_entries
 
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"esad_lend": ESADLEND}
+ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"esad_lend": ESADLEND, "wcsac": WCSAC, "sac_lag": SACLag}
 FOLDER = hyperparams.hyperparams_folder()
 ENTRIES = [(path.stem, env_id) for path in sorted(FOLDER.glob("*.yml")) for env_id in read_entries(path)]
 
@@ -47,7 +47,7 @@ def test_every_value_is_of_the_right_kind(name: str, env_id: str) -> None:
 
 @pytest.mark.parametrize(("name", "env_id"), [entry for entry in ENTRIES if entry[1] != "default"])
 def test_every_entry_builds_a_model(name: str, env_id: str) -> None:
-    n_timesteps, n_envs, arguments = load_hyperparams(ALGORITHMS[name], name, env_id)
+    n_timesteps, n_envs, arguments, _ = load_hyperparams(ALGORITHMS[name], name, env_id)
     model = ALGORITHMS[name](env=env_id, **arguments)
     assert n_timesteps > getattr(model, "learning_starts", 0) and n_envs >= 1
     for key, value in arguments.items():
@@ -74,9 +74,11 @@ def test_rates_as_rl_zoo_writes_them(folder: Path) -> None:
 
 
 def test_an_entry_is_preferred_to_the_default(folder: Path) -> None:
-    (folder / "mine.yml").write_text("default: {gamma: 0.5}\nA-v0: {n_timesteps: 7, n_envs: 3, policy: MlpPolicy}\n")
-    assert load_hyperparams(SAC, "mine", "A-v0") == (7, 3, {"policy": "MlpPolicy"})
-    assert load_hyperparams(SAC, "mine", "B-v0") == (100_000, 1, {"gamma": 0.5})
+    (folder / "mine.yml").write_text(
+        "default: {gamma: 0.5}\nA-v0: {n_timesteps: 7, n_envs: 3, frame_stack: 4, policy: MlpPolicy}\n"
+    )
+    assert load_hyperparams(SAC, "mine", "A-v0") == (7, 3, {"policy": "MlpPolicy"}, 4)
+    assert load_hyperparams(SAC, "mine", "B-v0") == (100_000, 1, {"gamma": 0.5}, 1)
 
 
 @pytest.mark.parametrize(

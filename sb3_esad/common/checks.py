@@ -3,6 +3,8 @@
 from typing import Any
 
 import numpy as np
+from gymnasium import spaces
+from stable_baselines3.common.preprocessing import is_image_space
 
 
 def require(valid: bool, name: str, value: Any, remedy: str) -> None:
@@ -35,15 +37,20 @@ def refuse_unknown(algorithm: str, arguments: dict[str, Any], not_offered: dict[
         raise TypeError(f"{algorithm} has no argument '{name}'.")
 
 
-def refuse_blank_images(images: dict[str, np.ndarray]) -> None:
+def refuse_blank_images(observations: np.ndarray | dict[str, np.ndarray], space: spaces.Space, normalize_images: bool) -> None:
     """
     Refuse images without any content.
 
-    :param images: those of all environments by key
-    :raises ValueError: if under a key each image has the same value in all of its pixels
+    :param observations: those of all environments, or those under each key of a Dict space
+    :param space: of a single one
+    :param normalize_images: whether images are bytes to be divided by 255
+    :raises ValueError: if each image, or each under a key, has the same value in all of its pixels
     """
     remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
-    for key, batch in images.items():
-        if all(np.max(image) == np.min(image) for image in batch):
+    parts = observations if isinstance(observations, dict) else {"observation": observations}
+    for key, batch in parts.items():
+        shown = space[key] if isinstance(space, spaces.Dict) else space
+        is_image = is_image_space(shown, normalized_image=not normalize_images)
+        if is_image and all(np.max(image) == np.min(image) for image in batch):
             reason = f"Every pixel of the first image '{key}' is {np.max(batch[0])}, nothing can be learned from it"
             raise ValueError(f"{reason}: {remedy}.")

@@ -54,25 +54,26 @@ class FrameStore:
 
     def get(self, steps: np.ndarray, envs: np.ndarray) -> np.ndarray:
         """
-        :param steps: (B, T) indices in the ring
-        :param envs: (B, 1)
-        :return: (B, T, ...) frames
+        :param steps: indices in the ring, of any shape S
+        :param envs: broadcastable to S
+        :return: (*S, ...) frames
         """
         return self.frames[steps, envs]
 
     def get_next(self, steps: np.ndarray, envs: np.ndarray, jumps: np.ndarray) -> np.ndarray:
         """
-        :param steps: (B, T) indices in the ring
-        :param envs: (B, 1)
-        :param jumps: (B, T) bool, the frame after the step opens another episode
-        :return: (B, T, ...) frames that the steps have led to
+        :param steps: indices in the ring, of any shape S
+        :param envs: broadcastable to S
+        :param jumps: bool, of shape S, the frame after the step opens another episode
+        :return: (*S, ...) frames that the steps have led to
         """
+        envs = np.broadcast_to(envs, steps.shape)
         following = self.frames[(steps + 1) % len(self.frames), envs]
         newest = steps == self._newest
-        following[newest] = self._heads[np.broadcast_to(envs, steps.shape)[newest]]
-        for b, t in zip(*np.nonzero(jumps & ~newest), strict=True):
-            key = int(steps[b, t]), int(envs[b, 0])
-            following[b, t] = self._set_aside.get(key, following[b, t])
+        following[newest] = self._heads[envs[newest]]
+        for index in zip(*np.nonzero(jumps & ~newest), strict=True):
+            key = int(steps[index]), int(envs[index])
+            following[index] = self._set_aside.get(key, following[index])
         return following
 
 

@@ -4,12 +4,11 @@ from abc import abstractmethod
 from collections import defaultdict
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Any, ClassVar, TypeVar
+from typing import Any, ClassVar
 
-import numpy as np
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
-from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Schedule
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
@@ -21,8 +20,6 @@ from sb3_esad.common.side_by_side import side_by_side
 from sb3_esad.common.starts import choose_starts
 from sb3_esad.common.target_networks import update_target
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
-
-SelfLatentAlgorithm = TypeVar("SelfLatentAlgorithm", bound="LatentAlgorithm")
 
 FALLING_RATE = HoldThenFall(start=0.006, hold=0.5)
 """A constant rate, large enough to learn, swings between driving too fast and crawling (docs/experiments.md, section 5)."""
@@ -84,29 +81,6 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         require(self.imagination_horizon >= 1, "imagination_horizon", self.imagination_horizon, "a number of steps >= 1")
         require(self.imagination_starts >= 2, "imagination_starts", self.imagination_starts, "a number of trajectories >= 2")
         require(self.max_grad_norm > 0, "max_grad_norm", self.max_grad_norm, "a bound > 0")
-
-    def learn(
-        self: SelfLatentAlgorithm,
-        total_timesteps: int = 100_000,
-        callback: MaybeCallback = None,
-        log_interval: int = 4,
-        tb_log_name: str | None = None,
-        reset_num_timesteps: bool = True,
-        progress_bar: bool = False,
-    ) -> SelfLatentAlgorithm:
-        """
-        Learn from the environment.
-
-        :param total_timesteps: number of environment steps
-        :param callback: called at every step
-        :param log_interval: episodes between two lines of the log
-        :param tb_log_name: name of the TensorBoard run; None for the name of the class
-        :param reset_num_timesteps: whether to count steps from zero
-        :param progress_bar: whether to show one
-        :return: the trained model
-        """
-        name = tb_log_name or type(self).__name__
-        return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
 
     def train(self, gradient_steps: int, batch_size: int = 16) -> None:
         """
@@ -207,11 +181,6 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
         return self.policy.actor(self.policy.world_model.features(start))
-
-    def _record(self, logs: dict[str, list[float]]) -> None:
-        self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in logs.items():
-            self.logger.record(f"train/{name}", float(np.mean(values)))
 
     def _optimizers(self) -> dict[str, th.optim.Optimizer]:
         names = ("world_model", "actor", "critic", "cost_critic")

@@ -19,6 +19,7 @@ from sb3_esad.common.latents import GaussianHead, LatentHead
 from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.rssm import RSSM
 from sb3_esad.common.target_networks import make_target
+from sb3_esad.common.torch_layers import GridReadout
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.common.world_model import WorldModel
 
@@ -99,8 +100,8 @@ class LatentPolicy(BasePolicy):
         rssm = self.world_model.rssm
         grid = (rssm.memory_shape[0] + rssm.latent_shape[0], *rssm.memory_shape[1:])
         self.actor = Actor(grid, rssm.action_dim, self.actor_arch)
-        self.critic = QEnsemble(grid, rssm.action_dim, self.critic_arch)
-        self.cost_critic = CostCritic(grid, rssm.action_dim, self.critic_arch)
+        self.critic = QEnsemble(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
+        self.cost_critic = CostCritic(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
         self.world_model_target, self.actor_target = make_target(self.world_model), make_target(self.actor)
         self.critic_target, self.cost_critic_target = make_target(self.critic), make_target(self.cost_critic)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # torch's stub does not know the keyword

@@ -1,23 +1,18 @@
-"""An off-policy algorithm whose policy remembers, and whose every step may have a cost."""
+"""An off-policy algorithm whose policy remembers."""
 
 from typing import Any
 
 import numpy as np
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import ReplayBuffer
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import ActionNoise
-from stable_baselines3.common.type_aliases import GymEnv, RolloutReturn, Schedule
-from stable_baselines3.common.utils import safe_mean
+from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
-from sb3_esad.common.checks import refuse_blank_images, refuse_unknown, require
-from sb3_esad.common.costs import EpisodeCosts
-from sb3_esad.common.memory import keep_freed_memory
+from sb3_esad.common.checks import refuse_unknown, require
+from sb3_esad.common.cost_aware_algorithm import CostAwareAlgorithm
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.type_aliases import LatentState
-from sb3_esad.common.whole_files import WholeFiles
 
 NOT_OFFERED = {
     "use_sde": "gSDE is not offered, pass an action_noise instead",
@@ -28,9 +23,9 @@ NOT_OFFERED = {
 """Arguments that other algorithms of SB3 have, and what to do without them."""
 
 
-class RecurrentOffPolicyAlgorithm(WholeFiles):
+class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
     """
-    SB3's off-policy algorithm with what it lacks: a memory between two actions, windows of steps to learn from, and costs.
+    SB3's off-policy algorithm with what it lacks: a memory between two actions, and windows of steps to learn from.
 
     :param policy: a :class:`LatentPolicy`, or the alias of one
     :param env: environment with a Box action space
@@ -61,7 +56,9 @@ class RecurrentOffPolicyAlgorithm(WholeFiles):
     :raises ValueError: if an argument is out of its range
     """
 
-    saved_mark = "random_hold"
+    saved_marks = ("random_hold",)
+    buffer_class = SequenceReplayBuffer
+    buffer_arguments = ("cost_key", "sequence_length")
     policy: LatentPolicy
     replay_buffer: SequenceReplayBuffer
     action_space: spaces.Box
@@ -108,7 +105,7 @@ class RecurrentOffPolicyAlgorithm(WholeFiles):
             train_freq,
             gradient_steps,
             action_noise,
-            replay_buffer_class or SequenceReplayBuffer,
+            replay_buffer_class,
             replay_buffer_kwargs,
             optimize_memory_usage,
             policy_kwargs=policy_kwargs,
@@ -119,15 +116,11 @@ class RecurrentOffPolicyAlgorithm(WholeFiles):
             support_multi_env=True,
             seed=seed,
             sde_support=False,
+            cost_key=cost_key,
         )
         self._check_action_space()
-        for name in ("sequence_length", "cost_key"):
-            given = self.replay_buffer_kwargs.get(name)
-            require(given is None, f"replay_buffer_kwargs[{name!r}]", given, f"it as the argument {name}")
         self.sequence_length = sequence_length
         self.random_hold = random_hold
-        self.cost_key = cost_key
-        self.total_cost = 0.0
         if _init_setup_model:
             self._setup_model()
 
@@ -139,40 +132,15 @@ class RecurrentOffPolicyAlgorithm(WholeFiles):
             raise ValueError(f"{type(self).__name__} needs a Box of actions, not {self.action_space}: {remedy}.")
 
     def _check_arguments(self) -> None:
-        require(self.batch_size >= 1, "batch_size", self.batch_size, "a number of windows >= 1")
-        require(0 < self.tau <= 1, "tau", self.tau, "a share in (0, 1]")
-        require(0 <= self.gamma <= 1, "gamma", self.gamma, "a discount in [0, 1]")
+        super()._check_arguments()
         require(self.random_hold >= 1, "random_hold", self.random_hold, "a number of steps >= 1")
-        buffer_class: Any = self.replay_buffer_class
-        fitting = issubclass(buffer_class, SequenceReplayBuffer)
-        require(fitting, "replay_buffer_class", buffer_class.__name__, "a SequenceReplayBuffer, which returns windows")
 
     def _setup_model(self) -> None:
-        self._check_arguments()
-        self.replay_buffer_kwargs = {
-            **self.replay_buffer_kwargs,
-            "sequence_length": self.sequence_length,
-            "cost_key": self.cost_key,
-        }
         super()._setup_model()
         self._last_latent = None
         self._random_actions: np.ndarray | None = None
-        self._episode_costs = EpisodeCosts()
 
-    def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
-        """
-        Collect steps.
-
-        :param args: see SB3's ``OffPolicyAlgorithm.collect_rollouts``
-        :param kwargs: likewise
-        :return: how many there were, and whether to go on
-        """
-        rollout = super().collect_rollouts(*args, **kwargs)
-        if not rollout.continue_training:
-            self._last_obs = None  # the step at which a callback stopped was not stored: to go on takes new episodes
-        return rollout
-
-    # Acting: SB3 asks for an action without a memory, and forgets which episodes have just begun
+    # Acting: SB3 asks for an action without a memory
 
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
@@ -206,52 +174,5 @@ class RecurrentOffPolicyAlgorithm(WholeFiles):
             self._random_actions = (np.random.rand(n_envs, 1) * scaled).astype(np.float32)
         return self._random_actions
 
-    def _store_transition(
-        self,
-        replay_buffer: ReplayBuffer,
-        buffer_action: np.ndarray,
-        new_obs: np.ndarray | dict[str, np.ndarray],
-        reward: np.ndarray,
-        dones: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
-        self._last_episode_starts = dones
-
-    def _has_enough_steps(self) -> bool:
-        """Whether there is enough to learn from: a loaded model that came without its buffer would unlearn on a few steps."""
-        buffer = self.replay_buffer
-        return buffer.full or buffer.size() * self.n_envs >= self.learning_starts
-
-    # Logging: what an episode costs stands beside what it earns
-
-    def _update_info_buffer(self, infos: list[dict[str, Any]], dones: np.ndarray | None = None) -> None:
-        assert dones is not None
-        costs = self.replay_buffer.read_costs(infos)
-        self.total_cost += float(costs.sum())
-        for episode in self._episode_costs.add(costs, dones):
-            infos[episode.env].get("episode", {})["c"] = episode.cost
-        super()._update_info_buffer(infos, dones)
-
-    def dump_logs(self) -> None:
-        """Write the log, costs included."""
-        costs = [info["c"] for info in self.ep_info_buffer or [] if "c" in info]
-        if costs:
-            self.logger.record("rollout/ep_cost_mean", safe_mean(costs))
-        self.logger.record("rollout/total_cost", self.total_cost)
-        self.logger.record("rollout/cost_rate", self.total_cost / max(self.num_timesteps, 1))
-        super().dump_logs()
-
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
-        keep_freed_memory()
-        result = super()._setup_learn(*args, **kwargs)
-        if self.num_timesteps == 0:
-            self.total_cost = 0.0
-        assert self._last_obs is not None and self._last_episode_starts is not None
-        if self._last_episode_starts.all():
-            self._episode_costs.clear()
-        refuse_blank_images(self.policy.world_model.images(self._last_obs))
-        return result
-
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_last_latent", "_random_actions", "_episode_costs"]
+        return [*super()._excluded_save_params(), "_last_latent", "_random_actions"]

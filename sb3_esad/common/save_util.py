@@ -47,28 +47,28 @@ def with_suffix(path: str | pathlib.Path, suffix: str) -> pathlib.Path:
     return path if path.suffix else pathlib.Path(f"{path}{suffix}")
 
 
-def check_saved_model(path: Target, algorithm: str, mark: str) -> None:
+def check_saved_model(path: Target, algorithm: str, marks: tuple[str, ...]) -> None:
     """
     Refuse a file that holds no model of an algorithm.
 
     :param path: file or file-like object, at whose start it is left; SB3's ``.zip`` may be missing
     :param algorithm: name of the class that shall load it
-    :param mark: an attribute that only models of this kind have
+    :param marks: attributes that only models of this kind have all of
     :raises ValueError: if it is missing, no zip, damaged, no model of SB3, or one of another algorithm
     """
     if not isinstance(path, str | pathlib.Path):
         path.seek(0)
-        _check_archive(path, getattr(path, "name", "the given file object"), algorithm, mark)
+        _check_archive(path, getattr(path, "name", "the given file object"), algorithm, marks)
         path.seek(0)
         return
     found = next((each for each in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if each.is_file()), None)
     if found is None:
         raise ValueError(f"There is no file {path}: give the zip that {algorithm}.save() has written.")
     with found.open("rb") as file:
-        _check_archive(file, str(found), algorithm, mark)
+        _check_archive(file, str(found), algorithm, marks)
 
 
-def _check_archive(file: Any, name: str, algorithm: str, mark: str) -> None:
+def _check_archive(file: Any, name: str, algorithm: str, marks: tuple[str, ...]) -> None:
     remedy = f"give the zip that {algorithm}.save() has written."
     if file.read(2) != b"PK":
         raise ValueError(f"{name} is no zip file: {remedy}")
@@ -84,7 +84,7 @@ def _check_archive(file: Any, name: str, algorithm: str, mark: str) -> None:
         raise ValueError(f"{name} is damaged at its member '{damaged}': save or copy it again.")
     if not complete:
         raise ValueError(f"{name} holds no model of Stable-Baselines3, or only a part of one: {remedy}")
-    if mark not in data:
+    if any(mark not in data for mark in marks):
         raise ValueError(f"{name} holds no {algorithm} but {_describe(data)}: load it with the class that saved it.")
 
 

@@ -94,7 +94,13 @@ def mlp(input_dim: int, net_arch: Sequence[int], output_dim: int, zero_output: b
     return nn.Sequential(*layers, output)
 
 
-class GridReadout(nn.Module):
+class Readout(nn.Module):
+    """A network that summarises what it is shown in one vector of ``features_dim`` numbers."""
+
+    features_dim: int
+
+
+class GridReadout(Readout):
     """
     Summarise a grid in one vector without losing what stands where.
 

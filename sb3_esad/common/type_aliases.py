@@ -12,6 +12,26 @@ NO_EVENT = 2**31 - 1
 """In ``SequenceSamples.time_to_event``: no cost follows."""
 
 
+class CostReplaySamples(NamedTuple):
+    """
+    A batch of single steps, as SB3's ``ReplayBufferSamples`` holds them, with their costs; B steps, A action dimensions.
+
+    :param observations: (B, ...), one tensor or one for each key of a Dict space
+    :param actions: (B, A), as executed, in [-1, 1]
+    :param next_observations: (B, ...), the last frame of an episode included
+    :param dones: (B, 1), 1 where the step ended in a terminal state (a time limit is not terminal)
+    :param rewards: (B, 1)
+    :param costs: (B, 1), never normalised
+    """
+
+    observations: th.Tensor | TensorDict
+    actions: th.Tensor
+    next_observations: th.Tensor | TensorDict
+    dones: th.Tensor
+    rewards: th.Tensor
+    costs: th.Tensor
+
+
 class SequenceSamples(NamedTuple):
     """
     A batch of windows of consecutive steps; B windows, T steps, A action dimensions.

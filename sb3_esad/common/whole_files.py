@@ -7,17 +7,17 @@ from typing import Any, ClassVar, TypeVar
 
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_esad.common.buffers import SequenceReplayBuffer, refuse_other_buffer
+from sb3_esad.common.cost_buffers import CostBuffer, refuse_other_buffer
 from sb3_esad.common.save_util import check_saved_model, whole_file
 
 SelfWhole = TypeVar("SelfWhole", bound="WholeFiles")
 
 
 class WholeFiles(OffPolicyAlgorithm):
-    """Saving and loading of an algorithm; :attr:`saved_mark` is an attribute by which its models are told from others."""
+    """Saving and loading of an algorithm; by :attr:`saved_marks`, attributes, its models are told from others."""
 
-    saved_mark: ClassVar[str]
-    replay_buffer: SequenceReplayBuffer
+    saved_marks: ClassVar[tuple[str, ...]]
+    replay_buffer: CostBuffer
 
     def save(
         self,
@@ -46,7 +46,7 @@ class WholeFiles(OffPolicyAlgorithm):
         :return: the model
         :raises ValueError: if the file is missing, damaged, of another version or holds something else
         """
-        check_saved_model(path, cls.__name__, mark=cls.saved_mark)
+        check_saved_model(path, cls.__name__, marks=cls.saved_marks)
         try:
             return super().load(path, *args, **kwargs)
         except ValueError:
@@ -69,7 +69,7 @@ class WholeFiles(OffPolicyAlgorithm):
 
     def load_replay_buffer(self, path: str | pathlib.Path | io.BufferedIOBase, truncate_last_traj: bool = True) -> None:
         """
-        Load a saved replay buffer; windows are as long, and costs have the key, as this model has it.
+        Load a saved replay buffer; what is asked of it, such as the key of the cost, is what this model asks.
 
         :param path: file that :meth:`save_replay_buffer` has written
         :param truncate_last_traj: see SB3's ``OffPolicyAlgorithm.load_replay_buffer``

@@ -118,11 +118,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         }
 
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        continue_after_cost = self.replay_buffer.continue_after_cost
+        continue_after_cost = self._raise_cost_bound()
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
-        if continue_after_cost > 0:
-            for each in (critic, target):
-                each.raise_bound(1 / (1 - self._cost_gamma))
         targets = cost_targets(target, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
         anchors = recorded_cost_targets(target, recorded, self._cost_gamma)
         weights = imagined.weights.flatten()

@@ -8,12 +8,11 @@ from typing import NamedTuple
 
 import torch as th
 
-from sb3_esad.common.critics import CostCritic, QEnsemble
+from sb3_esad.common.critics import CostCritic, CostTargets, QEnsemble
 from sb3_esad.common.functional import (
     expected_squared_error,
     indicator_joint,
     lambda_return,
-    sampled_variance_target,
 )
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
@@ -38,18 +37,6 @@ class Transitions(NamedTuple):
     next_actions: th.Tensor
     outcomes: Predictions
     event_weights: th.Tensor
-
-
-class CostTargets(NamedTuple):
-    """
-    Mean and variance of the discounted cost.
-
-    :param means: shape (N,)
-    :param variances: shape (N,)
-    """
-
-    means: th.Tensor
-    variances: th.Tensor
 
 
 @th.no_grad()
@@ -159,7 +146,6 @@ def recorded_return_targets(critic: QEnsemble, recorded: Transitions, gamma: flo
     return rewards + gamma * continues * critic(recorded.next_grids, recorded.next_actions).min(0).values
 
 
-@th.no_grad()
 def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: float) -> CostTargets:
     """
     One-step targets of the cost critics from what really happened: they keep the critics honest when the model is not.
@@ -169,11 +155,5 @@ def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: floa
     :param gamma: discount of the cost
     :return: fields of shape (N,)
     """
-    _, costs, continues = recorded.outcomes
-    next_means, next_variance = critic(recorded.next_grids, recorded.next_actions)
-    next_mean = next_means.mean(0)
-    mean = critic(recorded.grids, recorded.actions)[0].mean(0)
-    return CostTargets(
-        costs + gamma * continues * next_mean,
-        sampled_variance_target(costs, continues, mean, next_mean, next_variance, gamma),
-    )
+    taken_there, reached_there = (recorded.grids, recorded.actions), (recorded.next_grids, recorded.next_actions)
+    return critic.targets(taken_there, reached_there, recorded.outcomes.costs, recorded.outcomes.continues, gamma)
