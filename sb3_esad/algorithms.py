@@ -3,5 +3,10 @@
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad.esad_lend import ESADLEND
+from sb3_esad.wcsac import WCSAC, SACLag
 
-ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {"esad_lend": ESADLEND}
+ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
+    "esad_lend": ESADLEND,
+    "wcsac": WCSAC,
+    "sac_lag": SACLag,
+}

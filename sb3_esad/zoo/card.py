@@ -8,6 +8,7 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_esad.envs.intervals import poisson_interval
 from sb3_esad.report import Figures, format_table
 from sb3_esad.zoo.agents import Agent
 
@@ -45,15 +46,16 @@ A safe driver by {name} of `sb3_esad`, on Stable-Baselines3 and RL Zoo. {_limit(
 
 ## Use
 
+With `sb3_esad[zoo]` installed:
+
 ```bash
-pip install "sb3_esad[zoo]"
 python -m sb3_esad load_from_hub {words} -orga {organisation} -name {repo_name} -f logs
 python -m sb3_esad enjoy {words} -f logs
 ```
 
 ## Training
 
-`python -m sb3_esad train {words} -f logs` with
+{model.num_timesteps} steps by `python -m sb3_esad train {words} -f logs` with
 
 ```yaml
 {yaml.safe_dump(settings, sort_keys=True).strip()}
@@ -64,20 +66,25 @@ Python {platform.python_version()}, {", ".join(f"{package} {version(package)}" f
 
 
 def _limit(model: Any, figures: Figures) -> str:
-    """Say what was allowed, what was spent and whether the one is within the other, as far as the episodes can tell."""
-    limit = getattr(model, "cost_limit", None)
-    cost, low, high = (figures[f"cost{end}"] for end in ("", "_low", "_high"))
+    """
+    Say what was allowed, what was spent and whether the one is within the other, as far as the episodes can tell.
+
+    Student's interval has no width where no episode cost anything, and Poisson's too little where costs come in swarms: the
+    wider counts.
+    """
+    limit, episodes, cost = getattr(model, "cost_limit", None), figures["episodes"], figures["cost"]
+    least, most = poisson_interval(cost * episodes)
+    low, high = min(figures["cost_low"], least / episodes), max(figures["cost_high"], most / episodes)
     spent = f"An episode cost {cost:.3f} [{low:.3f}, {high:.3f}]"
     if limit is None:
         return f"{spent}, without any limit."
-    verdict = "kept" if high <= limit else "exceeded" if low > limit else "open, for the interval is on both sides of it"
+    verdict = "kept" if high <= limit else "exceeded" if low > limit else "open, for it lies within the interval"
     return f"{spent}; `cost_limit` allows {limit:g} with `risk_level` {model.risk_level:g}: {verdict}."
 
 
 def _metadata(agent: Agent, figures: Figures) -> ModelCardData:
     def result(metric: str, figure: str) -> EvalResult:
-        half = (figures[f"{figure}_high"] - figures[f"{figure}_low"]) / 2
-        value = f"{figures[figure]:.2f} +/- {half:.2f}"
+        value = f"{figures[figure]:.2f} [{figures[f'{figure}_low']:.2f}, {figures[f'{figure}_high']:.2f}]"
         task, env_id = "reinforcement-learning", agent.env.gym_id
         return EvalResult(task, env_id, env_id, metric, value, task_name=task, metric_name=metric)
 

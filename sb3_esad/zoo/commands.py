@@ -3,14 +3,15 @@
 import os
 import runpy
 import shutil
-import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
+from subprocess import call
 from tempfile import TemporaryDirectory
+from typing import Any
 from unittest import mock
 
 from imageio_ffmpeg import get_ffmpeg_exe
@@ -70,15 +71,16 @@ def _save_figures() -> None:
 
 
 def _record_training() -> None:
-    with mock.patch("subprocess.call", _record_by_our_command), _ffmpeg_on_path():
+    with _ffmpeg_on_path(), mock.patch("subprocess.call", _call_or_record):
         _run_script("rl_zoo3.record_training")
 
 
-def _record_by_our_command(command: Sequence[str]) -> int:
-    """RL Zoo's would start the first python there is, which knows none of our algorithms."""
-    *_, module = command[:3]
-    ours = [sys.executable, "-m", "sb3_esad", module.removeprefix("rl_zoo3."), *command[3:]]
-    return subprocess.run(ours, check=False).returncode
+def _call_or_record(command: Any, **kwargs: Any) -> int:
+    """RL Zoo films by ``python -m rl_zoo3.record_video``: whichever python comes first, which knows none of our algorithms."""
+    if list(command[1:3]) != ["-m", "rl_zoo3.record_video"]:
+        return call(command, **kwargs)
+    run("record_video", command[3:])
+    return 0
 
 
 @contextmanager

@@ -3,7 +3,6 @@
 import argparse
 import os
 import shutil
-import sys
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
@@ -36,7 +35,7 @@ def push_to_hub() -> None:
     :raises ValueError: if there is no such agent, or none that others could use without running its code
     :raises OSError: if the Hub cannot be reached, or refuses
     """
-    parser = _parser("with a card that says what it can do and what it costs")
+    parser = _parser("Share an agent with a card that says what it can do and what it costs.")
     parser.add_argument("--load-best", action="store_true", help="the best model instead of the last")
     parser.add_argument("-m", "--commit-message", default="An agent of sb3_esad", help="default: %(default)s")
     parser.add_argument("--episodes", type=int, default=100, help="of the evaluation (default: %(default)s)")
@@ -70,12 +69,12 @@ def load_from_hub() -> None:
     :raises ValueError: if it holds code and is not trusted, or if the folder is there already
     :raises OSError: if the Hub cannot be reached, or has no such agent
     """
-    parser = _parser("without running any code that it may hold")
+    parser = _parser("Fetch an agent without running any code that it may hold.")
     parser.add_argument("--force", action="store_true", help="replace the experiment if it is there")
     parser.add_argument("--trusted", action="store_true", help="unpickle the model, which may run any code")
     args = parser.parse_args()
     experiments, repository = Path(args.folder, args.algo), _repository(args)
-    number = args.exp_id or get_latest_run_id(str(experiments), args.env) + 1
+    number = args.exp_id if args.exp_id > 0 else get_latest_run_id(str(experiments), args.env) + 1
     target = experiments / f"{args.env}_{number}"
     if target.exists() and not args.force:
         raise ValueError(f"{target} is there already; replace it by --force, or leave out --exp-id.")
@@ -91,8 +90,8 @@ def load_from_hub() -> None:
     print(f"Saved to {target}")
 
 
-def _parser(how: str) -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(description=f"{sys.argv[0].split()[-1]}: an agent, {how}.")
+def _parser(description: str) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(description=description)
     parser.add_argument("--algo", choices=ALGORITHMS, required=True, help="algorithm")
     parser.add_argument("--env", type=EnvironmentName, required=True, help="environment")
     parser.add_argument("-f", "--folder", required=True, help="of RL Zoo's logs")
