@@ -3,6 +3,7 @@
 import re
 import shutil
 import zipfile
+import zlib
 from argparse import Namespace
 from collections.abc import Mapping
 from pathlib import Path
@@ -55,11 +56,11 @@ def find_agent(args: Namespace) -> Agent:
     _, model, log_path = get_model_path(args.exp_id, args.folder, args.algo, args.env, args.load_best)
     settings = Path(log_path, args.env)
     config, _ = get_saved_hyperparams(str(settings))
-    if not config.get("normalize"):
-        config.pop("normalize", None)  # which RL Zoo adds
+    if not config["normalize"]:
+        del config["normalize"]  # which RL Zoo adds
+    config.pop("env_kwargs", None)
     arguments = yaml.load((settings / ARGUMENTS).read_text(encoding="utf-8"), yaml.UnsafeLoader)
     env_kwargs = arguments["env_kwargs"] or {}
-    config.pop("env_kwargs", None)
     check_settings(config, args.algo, settings / CONFIG)
     return Agent(args.algo, args.env, Path(model), Path(log_path), config, env_kwargs)
 
@@ -78,7 +79,7 @@ def check_settings(settings: Mapping[str, Any], algo: str, source: object) -> No
     foreign = [str(key) for key in settings if key not in shared]
     if foreign:
         what = f"only arguments of {algorithm.__name__} and {', '.join(RUN_KEYS)} are shared"
-        raise ValueError(f"{source} has {', '.join(foreign)}, and {what}, for others may name code to run.")
+        raise ValueError(f"{source} has {', '.join(foreign)}; {what}, for others may name code to run.")
 
 
 def pack(folder: Path, agent: Agent) -> None:
@@ -157,13 +158,16 @@ def _read_settings(path: Path) -> Settings:
 
 
 def _unpack_curves(path: Path, target: Path) -> None:
-    with zipfile.ZipFile(path) as archive:
-        for name in filter(_is_curve, archive.namelist()):
-            with archive.open(name) as member:
-                content = member.read(LARGEST_CURVE + 1)
-            if len(content) > LARGEST_CURVE:
-                raise ValueError(f"{name} in {path.name} is larger than {LARGEST_CURVE >> 20} MiB.")
-            (target / name).write_bytes(content)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            for name in filter(_is_curve, archive.namelist()):
+                with archive.open(name) as member:
+                    content = member.read(LARGEST_CURVE + 1)
+                if len(content) > LARGEST_CURVE:
+                    raise ValueError(f"{name} in {path.name} is larger than {LARGEST_CURVE >> 20} MiB.")
+                (target / name).write_bytes(content)
+    except (zipfile.BadZipFile, zlib.error, EOFError, RuntimeError) as error:
+        raise ValueError(f"{path.name} is cut off or damaged ({error}).") from error
 
 
 def _is_curve(name: str) -> bool:

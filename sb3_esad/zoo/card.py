@@ -40,7 +40,8 @@ A safe driver by {name} of `sb3_esad`, on Stable-Baselines3 and RL Zoo. {_limit(
 
 ## Evaluation
 
-{len(seeds)} episodes with the seeds {seeds[0]} to {seeds[-1]}, by the best action; in brackets 95 % intervals. `replay.mp4` shows the first.
+{len(seeds)} episodes with the seeds {seeds[0]} to {seeds[-1]}, by the best action; in brackets 95 % intervals.
+If there is a `replay.mp4`, it shows the first.
 
 {format_table({name: figures})}
 

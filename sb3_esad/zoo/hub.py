@@ -7,9 +7,9 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any, cast
 
 import httpx2
-import numpy as np
 from huggingface_hub import HfApi
 from huggingface_sb3 import EnvironmentName, ModelName, ModelRepoId
 from rl_zoo3.utils import create_test_env, get_latest_run_id
@@ -56,7 +56,7 @@ def push_to_hub() -> None:
             film(folder / "replay.mp4", model, agent, args.n_timesteps)
         card = model_card(agent, model, figures, seeds, repository)
         (folder / "README.md").write_text(card, encoding="utf-8")
-        with _said_in_a_sentence(repository):
+        with _errors_on_one_line(repository):
             url = HfApi().create_repo(repository, exist_ok=True)
             HfApi().upload_folder(repo_id=repository, folder_path=folder, commit_message=args.commit_message)
     print(f"Shared at {url}")
@@ -80,7 +80,7 @@ def load_from_hub() -> None:
         raise ValueError(f"{target} is there already; replace it by --force, or leave out --exp-id.")
     experiments.mkdir(parents=True, exist_ok=True)
     with TemporaryDirectory() as downloaded, TemporaryDirectory(dir=experiments, prefix=".") as unfinished:
-        with _said_in_a_sentence(repository):
+        with _errors_on_one_line(repository):
             wanted = [ModelName(args.algo, args.env).filename, CONFIG, ENV_KWARGS, CURVES]
             HfApi().snapshot_download(repository, local_dir=downloaded, allow_patterns=wanted)
         whole = Path(unfinished, target.name)
@@ -106,7 +106,7 @@ def _repository(args: argparse.Namespace) -> str:
 
 
 @contextmanager
-def _said_in_a_sentence(repository: str) -> Iterator[None]:
+def _errors_on_one_line(repository: str) -> Iterator[None]:
     try:
         yield
     except httpx2.HTTPError as error:
@@ -129,10 +129,10 @@ def film(path: Path, model: BaseAlgorithm, agent: Agent, n_steps: int) -> None:
 
 
 def _pictures(model: BaseAlgorithm, env: VecEnv, n_steps: int) -> Iterator[Picture]:
-    observation, state, done = env.reset(), None, np.zeros(1, dtype=bool)
+    observation, state = cast(Any, env.reset()), None
     for _ in range(n_steps):
-        yield env.render()
+        yield cast(Picture, env.render())
         action, state = model.predict(observation, state, deterministic=True)
-        observation, _, done, _ = env.step(action)
-        if done.all():
+        observation, _, (done,), _ = env.step(action)
+        if done:
             return

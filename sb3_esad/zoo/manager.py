@@ -9,10 +9,12 @@ from typing import Any
 from optuna import Study, Trial
 from optuna.trial import FrozenTrial, TrialState
 from rl_zoo3.exp_manager import ExperimentManager
-from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_esad.algorithms import ALGORITHMS
 from sb3_esad.hyperparams import check_keys, hyperparams_folder, read_rate
+
+NOISE_KEYS = ("noise_type", "noise_std")
+"""Settings of which RL Zoo makes an ``action_noise``."""
 
 
 class CostAwareManager(ExperimentManager):
@@ -22,18 +24,17 @@ class CostAwareManager(ExperimentManager):
     :param args: of the command line
     :param algo: name of the algorithm
     :param rest: see RL Zoo's ``ExperimentManager``
-    :param config: file of hyperparameters; None for ours, or RL Zoo's where we have none
-    :param kwargs: see RL Zoo's ``ExperimentManager``
+    :param kwargs: likewise; without ``config``, a file of hyperparameters, it is ours, or RL Zoo's where we have none
     """
 
-    def __init__(self, args: Namespace, algo: str, *rest: Any, config: str | None = None, **kwargs: Any) -> None:
+    def __init__(self, args: Namespace, algo: str, *rest: Any, **kwargs: Any) -> None:
         ours = hyperparams_folder() / f"{algo}.yml"
-        if config is None and ours.is_file():
-            config = str(ours)
+        if kwargs.get("config") is None and ours.is_file():
+            kwargs["config"] = str(ours)
         if algo not in ALGORITHMS:
             # One that knows of no costs is evaluated like ours, and may drive where there are none
             warnings.filterwarnings("ignore", "No cost", UserWarning)
-        super().__init__(args, algo, *rest, config=config, **kwargs)
+        super().__init__(args, algo, *rest, **kwargs)
         self._study: Study | None = None
 
     @staticmethod
@@ -51,15 +52,10 @@ class CostAwareManager(ExperimentManager):
         if self._eval_env_kwargs_args is None:
             self.eval_env_kwargs = self.env_kwargs
         self.args.env_kwargs = self.env_kwargs
-        return processed
-
-    def _preprocess_action_noise(
-        self, hyperparams: dict[str, Any], saved_hyperparams: dict[str, Any], env: VecEnv
-    ) -> dict[str, Any]:
-        arguments = super()._preprocess_action_noise(hyperparams, saved_hyperparams, env)
         if self.algo in ALGORITHMS:
+            arguments = {key: value for key, value in processed[0].items() if key not in NOISE_KEYS}
             check_keys(ALGORITHMS[self.algo], arguments, f"{self.config} or --hyperparams")
-        return arguments
+        return processed
 
     def objective(self, trial: Trial) -> float:
         """

@@ -87,11 +87,11 @@ def sample(
     return {**settings, "learning_rate": read_rate(settings["learning_rate"], "the search")}
 
 
-def convert(params: dict[str, Any]) -> dict[str, Any]:
+def convert(sampled_params: dict[str, Any]) -> dict[str, Any]:
     """
     Turn what was drawn into settings as they stand in the files of ``hyperparams/``.
 
-    :param params: of a finished trial
+    :param sampled_params: of a trial
     :return: the settings; the learning rate falls to zero, as all do that were found to be good
     """
-    return {**params, "learning_rate": f"lin_{params['learning_rate']}"}
+    return {**sampled_params, "learning_rate": f"lin_{sampled_params['learning_rate']}"}
