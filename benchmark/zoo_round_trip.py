@@ -20,6 +20,8 @@ import numpy as np
 from sb3_esad.algorithms import ALGORITHMS
 
 ROOT = Path(__file__).parents[1]
+FEW_UPDATES = "learning_starts:500 train_freq:32 gradient_steps:1 pretrain_gradient_steps:0"
+"""What is tried is the way, not how well the agent drives in the end."""
 
 
 @contextmanager
@@ -84,12 +86,13 @@ def main() -> None:
     parser.add_argument("--algo", choices=ALGORITHMS, default="esad_lend", help="default: %(default)s")
     parser.add_argument("--env", default="esad-highway-v0", help="default: %(default)s")
     parser.add_argument("--steps", type=int, default=2000, help="of the training (default: %(default)s)")
+    parser.add_argument("--params", default=FEW_UPDATES, help="changed settings (default: %(default)s)")
     args = parser.parse_args()
     args.folder.mkdir(parents=True)
     agent, plots = f"--algo {args.algo} --env {args.env}", f"-a {args.algo} -e {args.env} -f logs"
-    start, evaluations = args.steps // 4, f"--eval-freq {args.steps // 4} --eval-episodes 5"
+    training = f"-n {args.steps} --eval-freq {args.steps // 4} --eval-episodes 5 --seed 0 -params {args.params}"
     with local_hub() as hub:
-        run(args.folder, hub, f"train {agent} -f logs -n {args.steps} {evaluations} --seed 0 -params learning_starts:{start}")
+        run(args.folder, hub, f"train {agent} -f logs {training}")
         watched = run(args.folder, hub, f"enjoy {agent} -f logs --no-render")
         run(args.folder, hub, f"record_video {agent} -f logs -n 100")
         run(args.folder, hub, f"plot_train {plots} -w 5")
