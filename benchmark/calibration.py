@@ -46,7 +46,7 @@ def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int) -> Visits:
     starts, latent = np.ones(n_envs, dtype=bool), policy.initial_state(n_envs)
     rows = []
     for _ in range(n_steps // n_envs):
-        latent = agent.filter(policy.obs_to_tensor(observation)[0], latent, th.as_tensor(starts), False)
+        latent = agent.observe(policy.obs_to_tensor(observation)[0], latent, th.as_tensor(starts), False).state
         action = agent.act(latent)
         with th.no_grad():
             means, variance = policy.cost_critic_target(agent.world_model.features(latent), action)

@@ -25,23 +25,25 @@ from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.hyperparams import load_hyperparams
 
-ENV = "esad-highway-v0"
 UNSEEN = 2_000_000
 """First seed of the evaluation; tune on others (--unseen)."""
 
 
-def tuned(algorithm: type[OffPolicyAlgorithm], name: str, seed: int, changes: dict[str, Any]) -> OffPolicyAlgorithm:
+def tuned(
+    algorithm: type[OffPolicyAlgorithm], name: str, env_id: str, seed: int, changes: dict[str, Any]
+) -> OffPolicyAlgorithm:
     """
     Build an algorithm of this package with the scenario's hyperparameters.
 
     :param algorithm: its class
     :param name: of its hyperparameters
+    :param env_id: scenario
     :param seed: of the training
     :param changes: arguments of the constructor to replace
     :return: the algorithm
     """
-    hyperparams = load_hyperparams(algorithm, name, ENV)
-    return algorithm(env=hyperparams.make_env(ENV), seed=seed, **{**hyperparams.arguments, **changes})
+    hyperparams = load_hyperparams(algorithm, name, env_id)
+    return algorithm(env=hyperparams.make_env(env_id), seed=seed, **{**hyperparams.arguments, **changes})
 
 
 class CostInReward(gym.Wrapper[Any, Any, Any, Any]):
@@ -67,21 +69,23 @@ class CostInReward(gym.Wrapper[Any, Any, Any, Any]):
         return observation, float(reward) - self.penalty * info["cost"], terminated, truncated, info
 
 
-def sac(seed: int, changes: dict[str, Any]) -> SAC:
+def sac(env_id: str, seed: int, changes: dict[str, Any]) -> SAC:
     """
     Build SB3's SAC for images that show speeds in one frame; settings by docs/experiments.md, section 14.
 
+    :param env_id: scenario
     :param seed: of the training
     :param changes: arguments of the constructor to replace, and ``penalty``, what a cost takes from the reward
     :return: the algorithm
     """
-    penalty = changes.pop("penalty", 10.0)
+    policy, penalty = changes.pop("policy", "CnnPolicy"), changes.pop("penalty", 10.0)
     tuned = {"batch_size": 64, "learning_rate": 1e-3, "ent_coef": "auto_0.1", "target_entropy": -1.0}
     arguments: dict[str, Any] = {"buffer_size": 50_000, "gamma": 0.97, "learning_starts": 1000, **tuned, **changes}
-    return SAC("CnnPolicy", make_vec_env(ENV, wrapper_class=partial(CostInReward, penalty=penalty)), seed=seed, **arguments)
+    env = make_vec_env(env_id, wrapper_class=partial(CostInReward, penalty=penalty))
+    return SAC(policy, env, seed=seed, **arguments)
 
 
-ALGORITHMS: dict[str, Callable[[int, dict[str, Any]], OffPolicyAlgorithm]] = {
+ALGORITHMS: dict[str, Callable[[str, int, dict[str, Any]], OffPolicyAlgorithm]] = {
     "esad_lend": partial(tuned, ESADLEND, "esad_lend"),
     "wcsac": partial(tuned, WCSAC, "wcsac"),
     "sac_lag": partial(tuned, SACLag, "sac_lag"),
@@ -94,13 +98,14 @@ class LearningCurve(BaseCallback):
     Drives unseen episodes every ``every`` steps, and at the end.
 
     :param path: file to which lines of JSON are appended
+    :param env_id: scenario
     :param every: environment steps
     :param seeds: of the episodes of each evaluation
     """
 
-    def __init__(self, path: Path, every: int, seeds: range) -> None:
+    def __init__(self, path: Path, env_id: str, every: int, seeds: range) -> None:
         super().__init__()
-        self.path, self.every, self.seeds = path, every, seeds
+        self.path, self.env_id, self.every, self.seeds = path, env_id, every, seeds
 
     def _on_training_start(self) -> None:
         self._next, self._seconds, self._resumed = self.every, 0.0, time.monotonic()
@@ -124,7 +129,7 @@ class LearningCurve(BaseCallback):
         line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
         line |= {"training_cost": self._cost, "training_episodes": self._episodes}
         for name, deterministic in (("best", True), ("sampled", False)):
-            line[name] = summarise(evaluate_model(self.model, ENV, self.seeds, deterministic))
+            line[name] = summarise(evaluate_model(self.model, self.env_id, self.seeds, deterministic))
         with self.path.open("a") as file:
             file.write(json.dumps(line) + "\n")
         self.model.save(self.path.with_suffix(".zip"))
@@ -136,6 +141,7 @@ def main() -> None:
     """Train and evaluate."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("algorithm", choices=list(ALGORITHMS))
+    parser.add_argument("--env", default="esad-highway-v0", help="scenario (default: %(default)s)")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=1500)
@@ -149,8 +155,8 @@ def main() -> None:
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{args.algorithm}_{args.seed}.jsonl"
     path.unlink(missing_ok=True)
-    curve = LearningCurve(path, args.every, range(args.unseen, args.unseen + args.episodes))
-    ALGORITHMS[args.algorithm](args.seed, args.set).learn(args.steps, callback=curve)
+    curve = LearningCurve(path, args.env, args.every, range(args.unseen, args.unseen + args.episodes))
+    ALGORITHMS[args.algorithm](args.env, args.seed, args.set).learn(args.steps, callback=curve)
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ def drive(model: ESADLEND, env: gym.Env[Any, Any], driver_name: str, seed: int) 
     driver = None if driver_name == "itself" else DRIVERS[driver_name](scenario_of(env), seed)
     states: list[LatentState] = []
     while True:
-        state = agent.filter(model.policy.obs_to_tensor(observation)[0], state, start, True)
+        state = agent.observe(model.policy.obs_to_tensor(observation)[0], state, start, True).state
         own = agent.act(state, True)
         chosen = own if driver is None else th.as_tensor(driver(env)).view_as(own)
         state, start = state._replace(action=chosen), th.zeros_like(start)

@@ -16,7 +16,7 @@ import torch as th
 from scipy.stats import rankdata
 from stable_baselines3.common.torch_layers import NatureCNN
 
-from sb3_esad import ESADLEND
+from sb3_esad import ESADLEND, SADLEN
 from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.type_aliases import LatentState, SequenceSamples
@@ -46,15 +46,15 @@ class Step(NamedTuple):
     info: dict[str, Any]
 
 
-def steps(config: dict[str, Any], seed: int) -> Iterator[Step]:
+def steps(env: gym.Env[Any, Any], seed: int) -> Iterator[Step]:
     """
     Drive with scripted drivers of all tempers, some of them so wild that they crash.
 
-    :param config: of the scenario
+    :param env: scenario
     :param seed: of scenario and drivers
     :return: endless steps
     """
-    env, random = gym.make(ENV, config=config), np.random.default_rng(seed)
+    random = np.random.default_rng(seed)
     drivers = (SpeedKeeper(), CarFollower(), ReferenceDriver())
     while True:
         observation, _ = env.reset(seed=int(random.integers(2**31)))
@@ -76,19 +76,18 @@ def steps(config: dict[str, Any], seed: int) -> Iterator[Step]:
             observation = following
 
 
-def record(config: dict[str, Any], n_steps: int, seed: int, length: int) -> SequenceReplayBuffer:
+def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int) -> SequenceReplayBuffer:
     """
     Fill a replay buffer.
 
-    :param config: of the scenario
+    :param env: scenario
     :param n_steps: how many steps
     :param seed: of scenario and drivers
     :param length: steps in a window
     :return: the buffer
     """
-    spaces = gym.make(ENV, config=config)
-    buffer = SequenceReplayBuffer(n_steps, spaces.observation_space, spaces.action_space, "auto", sequence_length=length)
-    for _, step in zip(range(n_steps), steps(config, seed), strict=False):
+    buffer = SequenceReplayBuffer(n_steps, env.observation_space, env.action_space, "auto", sequence_length=length)
+    for _, step in zip(range(n_steps), steps(env, seed), strict=False):
         observation, following, action, reward, done = (np.array([field]) for field in step[:-1])
         buffer.add(observation, following, action, reward, done, [step.info])
     return buffer
@@ -162,26 +161,21 @@ class Gauge:
         return {"IoU now": union[0], "IoU 1 s": union[5], "cost AUC": auc, "costs": float(np.sum(self.labels))}
 
 
-def trained(args: argparse.Namespace, arm: str, seed: int) -> tuple[ESADLEND, int]:
+def fit(algorithm: ESADLEND, seconds: float) -> int:
     """
-    Train the world model alone.
+    Train the world model alone on what is in the replay buffer.
 
-    :param args: of the command line
-    :param arm: key of ``ARMS``
-    :param seed: of data and networks
-    :return: the algorithm that owns the model, and the number of updates
+    :param algorithm: owns the model
+    :param seconds: of wall-clock
+    :return: the number of updates
     """
-    policy, config = ARMS[arm]
-    env = gym.make(ENV, config=config)
-    algorithm = ESADLEND("CnnPolicy", env, buffer_size=1000, policy_kwargs=dict(policy), seed=seed)
-    algorithm.replay_buffer = record(config, args.steps, seed, args.length)
     begin, updates = time.perf_counter(), 0
-    while (left := 1 - (time.perf_counter() - begin) / args.seconds) > 0:
+    while (left := 1 - (time.perf_counter() - begin) / seconds) > 0:
         for group in algorithm.policy.world_model.optimizer.param_groups:
             group["lr"] = 6e-3 * min(1.0, (updates + 1) / 20, left / 0.4 + 0.1)
         algorithm._update_world_model(algorithm._sample(16))
         updates += 1
-    return algorithm, updates
+    return updates
 
 
 def main() -> None:
@@ -197,8 +191,12 @@ def main() -> None:
     th.set_num_threads(args.threads)
     for arm in args.arms:
         for seed in args.seeds:
-            algorithm, updates = trained(args, arm, seed)
-            others, gauge = record(ARMS[arm][1], 4000, 1000 + seed, 32), Gauge()
+            policy, config = ARMS[arm]
+            env = gym.make(ENV, config=config)
+            algorithm = SADLEN("CnnPolicy", env, buffer_size=1000, policy_kwargs=dict(policy), seed=seed)
+            algorithm.replay_buffer = record(env, args.steps, seed, args.length)
+            updates = fit(algorithm, args.seconds)
+            others, gauge = record(env, 4000, 1000 + seed, 32), Gauge()
             with th.no_grad(), autocast(algorithm.device):
                 for _ in range(8):
                     samples = others.sample(32)

@@ -15,7 +15,7 @@ from sb3_esad.demo import ENV_ID, MINUTES, TIMESTEPS, run_demo
 from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.report import format_table, summarise_any, write_json
-from sb3_esad.video import record_driver, record_model
+from sb3_esad.video import record_driver, record_explanation, record_model
 
 ZOO_COMMANDS = {
     "train": "train an agent",
@@ -60,6 +60,7 @@ def make_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"sb3_esad {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     _add_evaluate(commands.add_parser("evaluate", help="drive episodes with a model or a scripted driver, print the metrics"))
+    _add_explain(commands.add_parser("explain", help="film an episode beside what the model thinks of it"))
     _add_demo(commands.add_parser("demo", help="train briefly, evaluate, write model, learning curve, results and video"))
     for name, text in ZOO_COMMANDS.items():
         # No word starts with a null, so all of them are handed on, --help too
@@ -105,6 +106,19 @@ def _evaluate(args: argparse.Namespace) -> None:
     if args.json:
         about = {"env": args.env, "driver": name, "how": how, "sb3_esad": __version__}
         write_json(args.json, {**about, "figures": figures, "records": records})
+
+
+def _add_explain(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_explain)
+    parser.add_argument("--model", type=Path, required=True, metavar="FILE.zip", help="saved ESADLEND model")
+    parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
+    parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the episode (default: %(default)s)")
+    parser.add_argument("--out", type=Path, default=Path("explanation.mp4"), metavar="FILE.mp4", help="(default: %(default)s)")
+
+
+def _explain(args: argparse.Namespace) -> None:
+    record_explanation(args.out, ESADLEND.load(args.model), args.env, args.seed)
+    print(f"Written: {args.out}")
 
 
 def _add_demo(parser: argparse.ArgumentParser) -> None:

@@ -12,7 +12,8 @@ from sb3_esad.envs import bev, drawing
 Picture = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
-SIZE = (1280, 624)  # columns and rows, multiples of 16 as video codecs like them [px]
+WIDTH, HEIGHT, ROW = 1280, 368, 256  # all columns, rows without panels, a row of panels: multiples of 16, as codecs like [px]
+IN_A_ROW = 3
 PANEL = (416, 208)
 TITLE = 28
 BACKGROUND, TEXT, FAINT = (24, 26, 30), (235, 235, 235), (150, 152, 158)
@@ -73,24 +74,25 @@ def compose(scene: Picture, panels: dict[str, Picture], gauges: list[Gauge], ver
     Put everything that belongs to one moment into one picture.
 
     :param scene: what happens, shape ``(320, 960, 3)``
-    :param panels: three small pictures by their titles
+    :param panels: small pictures by their titles, three in a row
     :param gauges: figures of the moment
     :param verdict: how the episode ended, empty as long as it goes on
-    :return: RGB picture, shape ``(624, 1280, 3)``
+    :return: RGB picture, 1280 pixels wide, 624 high with three panels and 880 with six
     """
-    canvas = Image.new("RGB", SIZE, BACKGROUND)
+    size = (WIDTH, HEIGHT + ROW * -(-len(panels) // IN_A_ROW))
+    canvas = Image.new("RGB", size, BACKGROUND)
     draw = ImageDraw.Draw(canvas)
     _write(draw, (8, 5), "What happens", 16)
     canvas.paste(Image.fromarray(scene), (0, TITLE))
-    top = TITLE + scene.shape[0] + 16
     for index, (title, picture) in enumerate(panels.items()):
-        left = index * (PANEL[0] + 16)
+        row, column = divmod(index, IN_A_ROW)
+        left, top = column * (PANEL[0] + 16), TITLE + scene.shape[0] + 16 + row * ROW
         _write(draw, (left + 8, top + 5), title, 16)
         enlarged = cv2.resize(picture, PANEL, interpolation=cv2.INTER_NEAREST)
         canvas.paste(Image.fromarray(enlarged), (left, top + TITLE))
     for index, gauge in enumerate(gauges):
         _draw_gauge(draw, gauge, scene.shape[1] + 24, TITLE + 4 + 82 * index)
-    _write(draw, (8, SIZE[1] - 21), CAPTION, 14, FAINT)
+    _write(draw, (8, size[1] - 21), CAPTION, 14, FAINT)
     if verdict:
         _write(draw, (scene.shape[1] // 2, TITLE + scene.shape[0] - 40), verdict, 30, MARK, "mm")
     return np.asarray(canvas)

@@ -1,11 +1,10 @@
 """Videos of an episode, beside it what the model remembers and dreams of it."""
 
-import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
@@ -17,10 +16,13 @@ from sb3_esad.driving_evaluation import check_scenario, check_spaces
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.envs.scenario import scenario_of
 from sb3_esad.esad_lend import ESADLEND
-from sb3_esad.panels import BAD, GOOD, Gauge, Picture, compose, paint
+from sb3_esad.explanation import ExplainedDriver
+from sb3_esad.moments import Moment, dreaming_frame, explaining_frame, image_of, render
+from sb3_esad.panels import Picture
+
+ModelDriver = TypeVar("ModelDriver", DreamingDriver, ExplainedDriver)
 
 LAST_FRAMES = 8
-SMALLEST_RISK = 1e-4
 
 
 def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, deterministic: bool = True) -> None:
@@ -38,7 +40,23 @@ def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, determinis
         check_spaces(model, env, env_id)
         check_image(env, env_id)
         driver = DreamingDriver(model, deterministic=deterministic)
-        write_video(path, _drive_dreaming(env, driver, seed), env.metadata["render_fps"])
+        write_video(path, _drive_model(env, driver, seed, dreaming_frame), env.metadata["render_fps"])
+
+
+def record_explanation(path: Path, model: ESADLEND, env_id: str, seed: int) -> None:
+    """
+    Film an episode of a model, beside it what it thinks possible, how dangerous that is, and where its filter steps in.
+
+    :param path: where to write the MP4
+    :param model: trained on images, or on a dictionary with an ``image``
+    :param env_id: driving scenario
+    :param seed: of the episode
+    :raises ValueError: if the environment is no driving scenario with an image, or not one that the model knows
+    """
+    with closing(_make(env_id)) as env:
+        check_spaces(model, env, env_id)
+        check_image(env, env_id)
+        write_video(path, _drive_model(env, ExplainedDriver(model), seed, explaining_frame), env.metadata["render_fps"])
 
 
 def record_driver(path: Path, name: str, env_id: str, seed: int) -> None:
@@ -87,7 +105,7 @@ def check_image(env: gym.Env[Any, Any], env_id: str) -> None:
     :param env_id: its name
     :raises ValueError: if there is no image in its observations
     """
-    if _image_of(env.observation_space.sample()) is None:
+    if image_of(env.observation_space.sample()) is None:
         raise ValueError(f"{env_id} has no image, so there is no dream to show; choose an id without -vector-.")
 
 
@@ -115,24 +133,26 @@ def _drive(env: gym.Env[Any, Any], name: str, seed: int) -> Iterator[Picture]:
     driver, done = DRIVERS[name](scenario_of(env), seed), False
     env.reset(seed=seed)
     while not done:
-        yield _render(env)
+        yield render(env)
         _, _, terminated, truncated, _ = env.step(driver(env))
         done = terminated or truncated
-    yield from [_render(env)] * LAST_FRAMES
+    yield from [render(env)] * LAST_FRAMES
 
 
-def _drive_dreaming(env: gym.Env[Any, Any], driver: DreamingDriver, seed: int) -> Iterator[Picture]:
+def _drive_model(
+    env: gym.Env[Any, Any], driver: ModelDriver, seed: int, frame: Callable[[Moment, ModelDriver], Picture]
+) -> Iterator[Picture]:
     observation, info = env.reset(seed=seed)
     verdict, cost, read_costs = "", 0.0, CostReader(driver.model.cost_key)
     while not verdict:
         action = driver(observation)
-        yield _frame(env, driver, observation, info, cost, verdict)
+        yield frame(Moment(env, observation, info, cost, verdict), driver)
         observation, _, terminated, truncated, info = env.step(action)
         cost += float(read_costs([info])[0])
         if terminated or truncated:
             verdict = _verdict(info, truncated)
     driver(observation)
-    yield from [_frame(env, driver, observation, info, cost, verdict)] * LAST_FRAMES
+    yield from [frame(Moment(env, observation, info, cost, verdict), driver)] * LAST_FRAMES
 
 
 def _verdict(info: dict[str, Any], truncated: bool) -> str:
@@ -141,59 +161,3 @@ def _verdict(info: dict[str, Any], truncated: bool) -> str:
     if info["is_success"]:
         return "Arrived"
     return "Off the road" if info["cost_terms"]["off_road"] else "Collision"
-
-
-def _frame(
-    env: gym.Env[Any, Any], driver: DreamingDriver, observation: Any, info: dict[str, Any], cost: float, verdict: str
-) -> Picture:
-    blind = driver.blind_steps / env.metadata["render_fps"]
-    dream = f"What it dreams, {blind:.1f} s without looking" if blind else "What it dreams, eyes open"
-    panels = {
-        "What it sees": paint(_image_of(observation) / 255.0),
-        "What it remembers of it": paint(_image_of(driver.reconstruction())[0].cpu().numpy()),
-        dream: paint(_image_of(driver.dream())[0].cpu().numpy()),
-    }
-    return compose(_render(env), panels, _gauges(env.unwrapped, driver, info, cost), verdict)
-
-
-def _gauges(scenario: Any, driver: DreamingDriver, info: dict[str, Any], cost: float) -> list[Gauge]:
-    config, speed, step_cost = scenario.config, info["speed"], float(info.get(driver.model.cost_key, 0.0))
-    risk, limit = driver.risk(), driver.model.cost_limit
-    budget = driver.model.penalty.budget
-    allowed = "no limit" if limit is None else f"budget {100 * budget:.2f} %"
-    return [
-        Gauge(
-            "speed, target marked",
-            f"{speed:.1f} m/s",
-            speed / config["max_speed"],
-            config["target_speed"] / config["max_speed"],
-            GOOD,
-        ),
-        Gauge("cost of this step", f"{step_cost:.0f}   episode {cost:.0f}", step_cost, None, BAD),
-        Gauge(
-            f"predicted risk, {allowed}",
-            f"{100 * risk:.1f} %",
-            _risk_share(risk),
-            None if limit is None else _risk_share(budget),
-            GOOD if limit is None or risk <= budget else BAD,
-        ),
-        Gauge("route driven", f"{100 * (1 - scenario.remaining):.0f} %", 1 - scenario.remaining, None, GOOD),
-    ]
-
-
-def _risk_share(risk: float) -> float:
-    """Place on a logarithmic scale from 0.01 % to 100 %: a budget of 1 % must be told from none."""
-    return 1 - math.log10(min(max(risk, SMALLEST_RISK), 1.0)) / math.log10(SMALLEST_RISK)
-
-
-def _image_of(observation: Any) -> Any:
-    """The image in an observation or reconstruction, None if there is none."""
-    if isinstance(observation, dict):
-        return observation.get("image", observation.get("observation"))
-    return observation if np.ndim(observation) == 3 else None
-
-
-def _render(env: gym.Env[Any, Any]) -> Picture:
-    picture = env.render()
-    assert isinstance(picture, np.ndarray)
-    return picture

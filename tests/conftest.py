@@ -10,8 +10,6 @@ import torch as th
 from gymnasium import spaces
 from stable_baselines3.common.utils import set_random_seed
 
-th.set_num_threads(1)
-
 TINY: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [16], "memory_channels": 8, "latent_channels": 4},
     "learning_rate": 1e-3,
@@ -30,8 +28,9 @@ TINY: dict[str, Any] = {
 
 @pytest.fixture(autouse=True)
 def seed() -> Iterator[int]:
-    """The same random numbers for every test, whichever ran before."""
+    """The same random numbers and threads for every test, whichever ran before."""
     set_random_seed(0)
+    th.set_num_threads(1)
     yield 0
 
 

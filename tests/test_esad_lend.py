@@ -28,7 +28,7 @@ from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.target_networks import make_target
-from sb3_esad.common.type_aliases import Imagination, LatentState, Predictions, SequenceSamples
+from sb3_esad.common.type_aliases import Belief, Imagination, LatentState, Predictions, SequenceSamples
 from sb3_esad.esad_lend.targets import recorded_transitions
 from tests.conftest import TINY, CountingEnv
 
@@ -474,13 +474,13 @@ def test_memory_starts_afresh_with_each_episode(monkeypatch: pytest.MonkeyPatch)
     env = DummyVecEnv([lambda: CountingEnv(episode_length=5), lambda: CountingEnv(time_limit=3)])
     model = make_model(env)
     starts: list[list[bool]] = []
-    filter_ = LatentAgent.filter
+    observe = LatentAgent.observe
 
-    def spy(agent: LatentAgent, obs: Any, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> LatentState:
+    def spy(agent: LatentAgent, obs: Any, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> Belief:
         starts.append(episode_start.tolist())
-        return filter_(agent, obs, state, episode_start, deterministic)
+        return observe(agent, obs, state, episode_start, deterministic)
 
-    monkeypatch.setattr(LatentAgent, "filter", spy)
+    monkeypatch.setattr(LatentAgent, "observe", spy)
     model.learn(24)
     assert [first for first, _ in starts] == [step % 5 == 0 for step in range(12)]
     assert [second for _, second in starts] == [step % 3 == 0 for step in range(12)]

@@ -12,18 +12,19 @@ import pytest
 import torch as th
 from conftest import CountingEnv
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
 
-from sb3_esad import ESADLEND
+from sb3_esad import ESADLEND, WCSAC
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.dream import DreamingDriver
-from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluate_model
+from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluate_model, stack_frames
 from sb3_esad.envs.metrics import DrivingMetrics
-from sb3_esad.panels import PANEL, SIZE, Gauge, compose, paint
+from sb3_esad.explanation import ExplainedDriver
+from sb3_esad.panels import HEIGHT, PANEL, ROW, WIDTH, Gauge, compose, paint
 from sb3_esad.plots import plot_learning_curve
 from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar, TrainingEpisode
 from sb3_esad.report import format_table, summarise_any
-from sb3_esad.video import record_driver, record_model, write_video
+from sb3_esad.video import record_driver, record_explanation, record_model, write_video
 
 SEEDS = [5, 0, 12, 7, 3, 9, 1, 30]
 TINY = {"net_arch": [8], "memory_channels": 4, "latent_channels": 2}
@@ -78,6 +79,25 @@ def test_every_seed_is_played_once_and_to_its_end(n_envs: int) -> None:
     assert [record["steps"] for record in records] == [seed + 1 for seed in SEEDS]
     assert [record["return"] for record in records] == [sum(range(1, seed + 2)) for seed in SEEDS]
     assert [record["cost"] for record in records] == [(seed + 1) // 3 for seed in SEEDS]
+
+
+def test_frames_are_stacked_as_the_model_was_shown_them() -> None:
+    env = VecFrameStack(DummyVecEnv([lambda: gym.make(ENV_IDS["CnnPolicy"])]), 4)
+    model = WCSAC("CnnPolicy", env, buffer_size=10, policy_kwargs={"net_arch": [8]}, device="cpu")
+    assert model.observation_space.shape == (12, 64, 64)
+    records = evaluate_model(model, ENV_IDS["CnnPolicy"], [3, 1])
+    assert [record["seed"] for record in records] == [3, 1] and all(record["steps"] > 0 for record in records)
+
+
+def test_only_what_becomes_the_wanted_space_is_stacked() -> None:
+    env = DummyVecEnv([CountingEnv])
+    three = gym.spaces.Box(0.0, 1e6, (3,), np.float32)
+    stacked = stack_frames(env, three)
+    stacked.reset()
+    shown = [stacked.step(np.zeros((1, 1)))[0].tolist() for _ in range(2)]  # type: ignore[union-attr]
+    assert stacked.observation_space == three and shown == [[[0, 0, 1]], [[0, 1, 2]]]
+    for other in (env.observation_space, gym.spaces.Box(0.0, 1.0, (3,), np.float32)):
+        assert stack_frames(env, other) is env
 
 
 def test_finished_episodes_stand_still() -> None:
@@ -210,7 +230,7 @@ def test_compose_has_the_size_of_a_video_frame() -> None:
     picture = compose(
         scene, {"seen": np.full((64, 64, 3), 200, np.uint8)}, [Gauge("risk", "1 %", 2.0, 0.5, (255, 0, 0))], "Arrived"
     )
-    assert picture.shape == (SIZE[1], SIZE[0], 3)
+    assert picture.shape == (HEIGHT + ROW, WIDTH, 3)
     assert (picture == 200).all(-1).sum() == PANEL[0] * PANEL[1]
 
 
@@ -230,9 +250,30 @@ def test_record_model(policy: str, tmp_path: Path) -> None:
     n_frames, shape, code = read_video(tmp_path / "episode.mp4")
     steps = int(evaluate_model(model, env_id, [3])[0]["steps"])
     assert steps < n_frames <= steps + 10
-    assert shape == (SIZE[1], SIZE[0], 3)
+    assert shape == (HEIGHT + ROW, WIDTH, 3)
     assert code in ("h264", "avc1")
     assert [path.name for path in tmp_path.iterdir()] == ["episode.mp4"]
+
+
+def test_what_is_explained_is_what_is_done(model: ESADLEND) -> None:
+    env = gym.make("short-image-v0")
+    driver, memory = ExplainedDriver(model, n_futures=5, horizon=3), None
+    for step in range(4):
+        observation, _ = env.reset(seed=step)
+        action = driver(observation)
+        expected, memory = model.predict(observation, state=memory, deterministic=True)
+        np.testing.assert_allclose(action, expected, rtol=1e-6)
+    futures = driver.futures()
+    assert th.equal(futures.costs, futures.costs.sort(descending=True).values)
+    assert futures.images["observation"].shape == (5, 3, 64, 64)
+    assert driver.tail(futures) == pytest.approx(futures.costs[:3].mean().item())  # of 5 the worst half
+    th.testing.assert_close(driver.futures().costs, futures.costs, msg="the same moment is explained by the same futures")
+
+
+def test_record_explanation(model: ESADLEND, tmp_path: Path) -> None:
+    record_explanation(tmp_path / "why.mp4", model, "short-image-v0", seed=3)
+    n_frames, shape, _ = read_video(tmp_path / "why.mp4")
+    assert n_frames > 10 and shape == (HEIGHT + 2 * ROW, WIDTH, 3)
 
 
 def test_record_driver(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad import ESADLEND, hyperparams
 from sb3_esad.algorithms import ALGORITHMS
-from sb3_esad.hyperparams import RUN_KEYS, check_keys, constructor_arguments, load_hyperparams, read_entries
+from sb3_esad.hyperparams import RUN_KEYS, Hyperparams, check_keys, constructor_arguments, load_hyperparams, read_entries
 
 FOLDER = hyperparams.hyperparams_folder()
 ENTRIES = [(path.stem, env_id) for path in sorted(FOLDER.glob("*.yml")) for env_id in read_entries(path)]
@@ -98,6 +98,12 @@ def test_mistakes_are_named(folder: Path, text: str, message: str) -> None:
     with pytest.raises(ValueError, match=message) as caught:
         load_hyperparams(SAC, "mine", "B-v0")
     assert "\n" not in str(caught.value)
+
+
+def test_environments_of_a_training() -> None:
+    env = Hyperparams(7, 3, {}, frame_stack=4).make_env("esad-highway-v0")
+    assert env.num_envs == 3 and env.observation_space.shape == (12, 64, 64)
+    env.close()
 
 
 def test_missing_files_are_named(folder: Path) -> None:

@@ -17,10 +17,8 @@ CPU = th.device("cpu")
 
 @pytest.fixture
 def two_threads() -> Iterator[None]:
-    before = th.get_num_threads()
     th.set_num_threads(2)
     yield
-    th.set_num_threads(before)
 
 
 def fail() -> None:

@@ -131,15 +131,15 @@ def test_acting_is_the_training_computation(kind: str, deterministic: None) -> N
         filtered = policy.world_model.observe(samples, seen(samples))
     state = policy.initial_state(3).map(lambda field: field + 7.0)  # an old memory, to be forgotten
     for t in range(5):
-        state = policy.learner.filter(
+        state = policy.learner.observe(
             at(samples.observations, (slice(None), t)), state, samples.is_first[:, t], deterministic=True
-        )
+        ).state
         state = state._replace(action=samples.actions[:, t])
         for acted, trained in zip(state, filtered.before, strict=True):
             th.testing.assert_close(acted, trained[t])
-    last = policy.learner.filter(
+    last = policy.learner.observe(
         at(samples.next_observations, (slice(None), -1)), state, th.zeros(3, dtype=th.bool), deterministic=True
-    )
+    ).state
     th.testing.assert_close(last.grid, filtered.states.grid[-1])
 
 
@@ -413,7 +413,7 @@ def test_pictures_of_any_size(shape: tuple[int, int, int]) -> None:
     model = policy.world_model
     cells = (-(-shape[1] // 8), -(-shape[2] // 8))
     assert model.rssm.memory_shape == (8, *cells) and model.rssm.latent_shape == (4, *cells)
-    state = policy.learner.filter(draw(space, (2,)), policy.initial_state(2), th.ones(2) > 0, deterministic=False)
+    state = policy.learner.observe(draw(space, (2,)), policy.initial_state(2), th.ones(2) > 0, deterministic=False).state
     assert state.grid.shape == (2, 12, *cells)
     assert model.reconstruct(state)["observation"].shape == (2, *shape)
     samples = make_samples(space, [[1, 0]] * 2)

@@ -1,4 +1,4 @@
-"""How a world model and an actor drive: take in an observation, choose an action."""
+"""How the networks drive together: take in an observation, propose an action, foresee where it leads."""
 
 from typing import NamedTuple
 
@@ -6,26 +6,29 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_esad.common.actor import Actor
+from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.precision import autocast
-from sb3_esad.common.type_aliases import LatentState
+from sb3_esad.common.type_aliases import Belief, LatentState
 from sb3_esad.common.world_model import WorldModel
 
 
 class LatentAgent(NamedTuple):
     """
-    A world model, and the actor that acts on its states; its memory is the caller's.
+    A world model, the actor that acts on its states, and the critics that judge what it does; its memory is the caller's.
 
     :param world_model: filters observations
-    :param actor: chooses actions
+    :param actor: proposes actions
+    :param critic: expects returns
+    :param cost_critic: expects costs
     """
 
     world_model: WorldModel
     actor: Actor
+    critic: QEnsemble
+    cost_critic: CostCritic
 
     @th.no_grad()
-    def filter(
-        self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool
-    ) -> LatentState:
+    def observe(self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool) -> Belief:
         """
         Take in an observation, forgetting the past where an episode starts.
 
@@ -33,11 +36,12 @@ class LatentAgent(NamedTuple):
         :param state: the previous state and the executed action
         :param episode_start: bool, of shape (N,)
         :param deterministic: take the mean of the latent instead of a sample
-        :return: the present state
+        :return: the present state, and the embedding of the observation
         """
         kept = state.map(lambda field: field.masked_fill(episode_start.view(-1, *[1] * (field.dim() - 1)), 0.0))
         with autocast(episode_start.device):
-            return self.world_model.filter(kept, observation, deterministic)
+            embedding = self.world_model.embed(observation)
+            return Belief(self.world_model.rssm.filter(kept, embedding, deterministic), embedding)
 
     @th.no_grad()
     def act(self, state: LatentState, deterministic: bool = False) -> th.Tensor:

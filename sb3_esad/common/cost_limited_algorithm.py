@@ -13,7 +13,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, PyTorch
 from sb3_esad.common.callbacks import LagrangeCallback, prepend
 from sb3_esad.common.checks import require
 from sb3_esad.common.cost_aware_algorithm import CostAwareAlgorithm
-from sb3_esad.common.functional import capped_cvar, tail_factor
+from sb3_esad.common.functional import tail_factor
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.penalties import NoPenalty, Penalty
 
@@ -74,7 +74,8 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         tail_factor(self.risk_level)  # refuses a level outside (0, 1], with and without a limit
-        require(0 <= self._cost_gamma < 1, "cost_gamma", self._cost_gamma, "a discount in [0, 1), also where it is gamma")
+        discount = self.discount_of_cost
+        require(0 <= discount < 1, "cost_gamma", discount, "a discount in [0, 1), also where it is gamma")
 
     def _setup_model(self) -> None:
         super()._setup_model()
@@ -86,7 +87,7 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         return penalty_class(
             cost_limit=self.cost_limit,
             risk_level=self.risk_level,
-            cost_gamma=self._cost_gamma,
+            cost_gamma=self.discount_of_cost,
             episode_length=self._episode_length(),
             lambda_lr=self.lambda_lr,
             lagrangian_multiplier_init=self.lagrangian_multiplier_init,
@@ -106,7 +107,8 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         return UNKNOWN_LENGTH
 
     @property
-    def _cost_gamma(self) -> float:
+    def discount_of_cost(self) -> float:
+        """``cost_gamma``, or ``gamma`` where it is None."""
         return self.gamma if self.cost_gamma is None else self.cost_gamma
 
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
@@ -140,7 +142,8 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
     def _note_risk(self, actions: th.Tensor) -> None:
         """Note what the critics expect where the policy really is: replayed states are those of policies that are gone."""
         means, variance = self.policy.cost_critic_target(self._last_state(), actions)
-        self._violations.append(self._risk(means, variance).mean() - self.penalty.budget)
+        risk = self.policy.cost_critic_target.risk(means, variance, self.risk_level)
+        self._violations.append(risk.mean() - self.penalty.budget)
         self.penalty.note_prediction(means.mean(0))
 
     def risk(self, states: PyTorchObs, actions: th.Tensor) -> th.Tensor:
@@ -151,10 +154,8 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         :param actions: their actions, scaled to [-1, 1], of shape (N, A)
         :return: shape (N,)
         """
-        return self._risk(*self.policy.cost_critic_target(states, actions))
-
-    def _risk(self, means: th.Tensor, variance: th.Tensor) -> th.Tensor:
-        return capped_cvar(means, variance, self.risk_level, self.policy.cost_critic_target.bound).max(0).values
+        means, variance = self.policy.cost_critic_target(states, actions)
+        return self.policy.cost_critic_target.risk(means, variance, self.risk_level)
 
     def _raise_cost_bound(self) -> float:
         """
@@ -165,7 +166,7 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         continue_after_cost = self.replay_buffer.continue_after_cost
         if continue_after_cost > 0:
             for critic in (self.policy.cost_critic, self.policy.cost_critic_target):
-                critic.raise_bound(1 / (1 - self._cost_gamma))
+                critic.raise_bound(1 / (1 - self.discount_of_cost))
         return continue_after_cost
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:

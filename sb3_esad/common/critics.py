@@ -6,7 +6,7 @@ import torch as th
 from stable_baselines3.common.type_aliases import PyTorchObs
 from torch import nn
 
-from sb3_esad.common.functional import sampled_variance_target
+from sb3_esad.common.functional import capped_cvar, sampled_variance_target
 from sb3_esad.common.heads import ValueDistribution
 from sb3_esad.common.torch_layers import LearningModule, Readout, dense_block, mlp
 
@@ -162,6 +162,17 @@ class CostCritic(LearningModule):
         """
         logits, variance = self.raw(state, action)
         return self.bound * logits.sigmoid(), variance
+
+    def risk(self, means: th.Tensor, variance: th.Tensor, risk_level: float) -> th.Tensor:
+        """
+        Safety measure Gamma by the more pessimistic mean: pessimism belongs to decisions, not to targets.
+
+        :param means: shape (n_critics, N)
+        :param variance: shape (N,)
+        :param risk_level: worst fraction of outcomes, in (0, 1]
+        :return: conditional value at risk of the cost to come, of shape (N,)
+        """
+        return capped_cvar(means, variance, risk_level, self.bound).max(0).values
 
     def raw(self, state: PyTorchObs, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -87,18 +87,32 @@ class LatentHead(nn.Module, ABC):
         """
 
     @abstractmethod
-    def sample(self, memory: th.Tensor, embedding: th.Tensor | None = None, n_candidates: int = 1) -> th.Tensor:
+    def sample(
+        self,
+        memory: th.Tensor,
+        embedding: th.Tensor | None = None,
+        n_candidates: int = 1,
+        generator: th.Generator | None = None,
+    ) -> th.Tensor:
         """
         Draw candidate latents, from the prior or, given an observation, from the posterior.
 
         :param memory: h, of shape (N, C, H, W)
         :param embedding: what :meth:`embed` made of the observation, of shape (N, C', H, W)
         :param n_candidates: how many latents to draw for each memory
+        :param generator: of the noise; torch's global one if there is none
         :return: latents, of shape (n_candidates * N, C, H, W), candidates first
         """
 
     @abstractmethod
-    def loss(self, posterior: Gaussian, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, Logs]:
+    def loss(
+        self,
+        posterior: Gaussian,
+        prior: Gaussian,
+        memory: th.Tensor,
+        embedding: th.Tensor,
+        generator: th.Generator | None = None,
+    ) -> tuple[th.Tensor, Logs]:
         """
         Fit prior and posterior to each other, and whatever else the head draws its latents with.
 
@@ -106,6 +120,7 @@ class LatentHead(nn.Module, ABC):
         :param prior: p(z | h), of the same shape
         :param memory: h, from which both were inferred, of shape (..., C', H, W)
         :param embedding: what :meth:`embed` made of the observation, of shape (..., C'', H, W)
+        :param generator: of all that is drawn; torch's global one if there is none
         :return: scalar loss, and what to log
         """
 
@@ -155,11 +170,24 @@ class GaussianHead(LatentHead):
     def posterior(self, memory: th.Tensor, embedding: th.Tensor) -> Gaussian:
         return self._gaussian(self.posterior_net(self.memory_net(memory) + embedding))
 
-    def sample(self, memory: th.Tensor, embedding: th.Tensor | None = None, n_candidates: int = 1) -> th.Tensor:
+    def sample(
+        self,
+        memory: th.Tensor,
+        embedding: th.Tensor | None = None,
+        n_candidates: int = 1,
+        generator: th.Generator | None = None,
+    ) -> th.Tensor:
         gaussian = self.prior(memory) if embedding is None else self.posterior(memory, embedding)
-        return Gaussian(*(th.cat([parameter] * n_candidates) for parameter in gaussian)).sample()
+        return Gaussian(*(th.cat([parameter] * n_candidates) for parameter in gaussian)).sample(generator)
 
-    def loss(self, posterior: Gaussian, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor) -> tuple[th.Tensor, Logs]:
+    def loss(
+        self,
+        posterior: Gaussian,
+        prior: Gaussian,
+        memory: th.Tensor,
+        embedding: th.Tensor,
+        generator: th.Generator | None = None,
+    ) -> tuple[th.Tensor, Logs]:
         dynamics = kl_divergence(posterior.detach(), prior)
         representation = kl_divergence(posterior, prior.detach())
         terms = (dynamics, representation)

@@ -1,5 +1,6 @@
 """The policy of all latent algorithms: it owns every network, and acts with a memory that the caller carries."""
 
+from contextlib import nullcontext
 from typing import Any, ClassVar
 
 import numpy as np
@@ -16,11 +17,13 @@ from sb3_esad.common.checks import require
 from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
+from sb3_esad.common.noise import fixed_seed
 from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.rssm import RSSM
+from sb3_esad.common.selection import ActionFilter, NoFilter, Selection
 from sb3_esad.common.target_networks import make_target
 from sb3_esad.common.torch_layers import GridReadout
-from sb3_esad.common.type_aliases import LatentState
+from sb3_esad.common.type_aliases import Belief, LatentState
 from sb3_esad.common.world_model import WorldModel
 
 NumpyState = tuple[np.ndarray, ...]
@@ -93,6 +96,7 @@ class LatentPolicy(BasePolicy):
         self.latent_channels = latent_channels
         self.world_model_kwargs = world_model_kwargs or {}
         self.head_kwargs = head_kwargs or {}
+        self.action_filter: ActionFilter = NoFilter()
         self._build(lr_schedule)
 
     def _build(self, lr_schedule: Schedule) -> None:
@@ -144,13 +148,13 @@ class LatentPolicy(BasePolicy):
 
     @property
     def learner(self) -> LatentAgent:
-        """The networks that learn, as they act together."""
-        return LatentAgent(self.world_model, self.actor)
+        """World model and actor that learn, as they act together; they are judged by the averages of the critics."""
+        return LatentAgent(self.world_model, self.actor, self.critic_target, self.cost_critic_target)
 
     @property
     def average(self) -> LatentAgent:
         """The averages of the networks, as they act together."""
-        return LatentAgent(self.world_model_target, self.actor_target)
+        return LatentAgent(self.world_model_target, self.actor_target, self.critic_target, self.cost_critic_target)
 
     def initial_state(self, n_envs: int) -> LatentState:
         """
@@ -189,9 +193,9 @@ class LatentPolicy(BasePolicy):
                 f"predict() was given {n_envs} observation(s) with {len(start)} values of episode_start: {remedy}."
             )
         starts = th.as_tensor(start, device=self.device)
-        latent = self.average.filter(tensor, self._from_numpy(state, n_envs), starts, deterministic)
-        actions = self.average.act(latent, deterministic)
-        new_state = tuple(field.flatten(1)[None].cpu().numpy() for field in latent._replace(action=actions))
+        belief, selection = self.decide(tensor, self._from_numpy(state, n_envs), starts, deterministic)
+        actions = selection.actions
+        new_state = tuple(field.flatten(1)[None].cpu().numpy() for field in belief.state._replace(action=actions))
         unscaled = self.unscale_action(actions.cpu().numpy().reshape(-1, *self.action_space.shape))
         unscaled = unscaled.astype(self.action_space.dtype, copy=False)
         return (unscaled if vectorized else unscaled[0]), new_state
@@ -199,7 +203,24 @@ class LatentPolicy(BasePolicy):
     def _predict(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         n = len(next(iter(observation.values())) if isinstance(observation, dict) else observation)
         start = th.ones(n, dtype=th.bool, device=self.device)
-        return self.average.act(self.average.filter(observation, self.initial_state(n), start, deterministic), deterministic)
+        return self.decide(observation, self.initial_state(n), start, deterministic)[1].actions
+
+    def decide(
+        self, observation: PyTorchObs, state: LatentState, episode_start: th.Tensor, deterministic: bool
+    ) -> tuple[Belief, Selection]:
+        """
+        Take in an observation and choose the action to execute.
+
+        :param observation: of shape (N, ...)
+        :param state: the previous state and the executed action
+        :param episode_start: bool, of shape (N,)
+        :param deterministic: take means instead of samples, and the same noise each time where the filter needs some
+        :return: what is known now, and what shall be executed
+        """
+        belief = self.average.observe(observation, state, episode_start, deterministic)
+        proposed = self.average.act(belief.state, deterministic)
+        with fixed_seed(self.device) if deterministic else nullcontext():
+            return belief, self.action_filter.select(self.average, belief, proposed)
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """

@@ -12,7 +12,7 @@ from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.checks import refuse_unknown, require
 from sb3_esad.common.cost_aware_algorithm import CostAwareAlgorithm
 from sb3_esad.common.policies import LatentPolicy
-from sb3_esad.common.type_aliases import LatentState
+from sb3_esad.common.type_aliases import Belief, LatentState
 
 NOT_OFFERED = {
     "use_sde": "gSDE is not offered, pass an action_noise instead",
@@ -145,26 +145,30 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
     def _sample_action(
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
-        latent = self._filter_last_observation(n_envs)
-        if self.num_timesteps < learning_starts:
-            scaled = self._held_random_actions(n_envs)
-        else:
-            scaled = self.policy.learner.act(latent).cpu().numpy()
+        belief = self._take_in_last_observation(n_envs)
+        warm_up = self.num_timesteps < learning_starts
+        scaled = self._held_random_actions(n_envs) if warm_up else self.policy.learner.act(belief.state).cpu().numpy()
         if action_noise is not None:
             scaled = np.clip(scaled + np.reshape(action_noise(), scaled.shape), -1, 1).astype(np.float32)
+        actions = th.as_tensor(scaled, device=self.device)
         # The memory must hold the action that is executed, or it would learn from a world that did not happen
-        self._last_latent = latent._replace(action=th.as_tensor(scaled, device=self.device))
-        shaped = scaled.reshape(n_envs, *self.action_space.shape)
+        executed = actions if warm_up else self._select(belief, actions)
+        self._last_latent = belief.state._replace(action=executed)
+        shaped = executed.cpu().numpy().reshape(n_envs, *self.action_space.shape)
         return self.policy.unscale_action(shaped).astype(self.action_space.dtype), shaped
 
-    def _filter_last_observation(self, n_envs: int) -> LatentState:
+    def _select(self, belief: Belief, proposed: th.Tensor) -> th.Tensor:
+        """Choose what is executed where the actor proposes an action, of shape (N, A)."""
+        return self.policy.action_filter.select(self.policy.learner, belief, proposed).actions
+
+    def _take_in_last_observation(self, n_envs: int) -> Belief:
         starts = self._last_episode_starts
         if self._last_latent is None or starts is None:
             starts, self._last_latent = np.ones(n_envs, dtype=bool), self.policy.initial_state(n_envs)
         assert self._last_obs is not None
         observation, _ = self.policy.obs_to_tensor(self._last_obs)
         episode_start = th.as_tensor(starts, device=self.device)
-        return self.policy.learner.filter(observation, self._last_latent, episode_start, False)
+        return self.policy.learner.observe(observation, self._last_latent, episode_start, False)
 
     def _held_random_actions(self, n_envs: int) -> np.ndarray:
         if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:

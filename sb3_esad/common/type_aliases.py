@@ -91,6 +91,18 @@ class LatentState(NamedTuple):
         return LatentState(*map(function, self))
 
 
+class Belief(NamedTuple):
+    """
+    What is known once an observation has been taken in.
+
+    :param state: N states, the latent drawn from the posterior or its mean
+    :param embedding: what the latent head made of the observation, of shape (N, C, H, W)
+    """
+
+    state: LatentState
+    embedding: th.Tensor
+
+
 class Predictions(NamedTuple):
     """
     What a state is expected to have brought when it was reached.

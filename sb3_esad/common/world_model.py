@@ -183,7 +183,16 @@ class WorldModel(LearningModule):
         :param states: N states
         :return: preprocessed observations by key, of shape (N, ...); the key of a single observation is "observation"
         """
-        return {key: head(self.features(states)) for key, head in self._observation_heads()}
+        return self.decode(self.features(states))
+
+    def decode(self, grids: th.Tensor) -> dict[str, th.Tensor]:
+        """
+        Show what features of states look like.
+
+        :param grids: features, of shape (N, C, H, W)
+        :return: see :meth:`reconstruct`
+        """
+        return {key: head(grids) for key, head in self._observation_heads()}
 
     def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, Logs]:
         """
@@ -199,14 +208,15 @@ class WorldModel(LearningModule):
         targets = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
         weights = samples.event_weights.expand_as(steps).flatten()
         prediction_loss, logs = self.predictions.loss(grid, targets, weights)
-        kl_loss, kl_logs = self.rssm.head.loss(filtered.posterior, filtered.prior, filtered.states.memory, filtered.embeddings)
         # Decoding is the dearest part, and half of the frames say as much about the other half
         some = th.randperm(len(grid), device=grid.device, generator=generator)[: (len(grid) + 1) // 2]
+        distributions = (filtered.posterior, filtered.prior)
+        head_loss, head_logs = self.rssm.head.loss(*distributions, filtered.states.memory, filtered.embeddings, generator)
         seen = self._preprocess(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)[some]))
         observation_losses = [head.loss(grid[some], _by_key(seen)[key]) for key, head in self._observation_heads()]
         observation_loss = th.stack(observation_losses).sum()
-        loss = observation_loss + prediction_loss + kl_loss
-        return loss, filtered, {**logs, **kl_logs, "observation_loss": observation_loss.item()}
+        loss = observation_loss + prediction_loss + head_loss
+        return loss, filtered, {**logs, **head_logs, "observation_loss": observation_loss.item()}
 
     def _withhold(self, steps: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         # Every window hides one stretch, so that the prior is trained on what it will be used for: going on alone

@@ -1,28 +1,28 @@
 """ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
 
 import math
-from typing import Any
+from typing import Any, ClassVar
 
 import torch as th
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.constrained_algorithm import ConstrainedLatentAlgorithm
 from sb3_esad.common.entropy import make_entropy_coefficient
 from sb3_esad.common.functional import capped_cvar
+from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns, taken
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
+from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
     Transitions,
     cost_targets,
-    imagined_costs,
-    imagined_returns,
     recorded_cost_targets,
     recorded_return_targets,
     recorded_transitions,
-    taken,
 )
 
 
@@ -48,6 +48,12 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
+
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
+        "MlpPolicy": MlpPolicy,
+        "CnnPolicy": CnnPolicy,
+        "MultiInputPolicy": MultiInputPolicy,
+    }
 
     def __init__(
         self,
@@ -120,8 +126,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
         continue_after_cost = self._raise_cost_bound()
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
-        targets = cost_targets(target, imagined, self._cost_gamma, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(target, recorded, self._cost_gamma)
+        targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
+        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost)
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
@@ -166,7 +172,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
         from it to crash less often ("blindness to success", arXiv 2205.05138): hence without the bound.
         """
-        costs = imagined_costs(self.policy.cost_critic, imagined, self._cost_gamma, self.lambda_return)
+        costs = imagined_costs(self.policy.cost_critic, imagined, self.discount_of_cost, self.lambda_return)
         _, variance = self.policy.cost_critic(*taken(imagined))
         return capped_cvar(costs, variance.view_as(costs), self.risk_level, math.inf)
 

@@ -126,7 +126,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         self._raise_cost_bound()
         taken, reached = (samples.observations, samples.actions), (samples.next_observations, next_actions)
         costs, continues = samples.costs.flatten(), 1 - samples.dones.flatten()
-        targets = self.policy.cost_critic_target.targets(taken, reached, costs, continues, self._cost_gamma)
+        targets = self.policy.cost_critic_target.targets(taken, reached, costs, continues, self.discount_of_cost)
         mean_loss, variance_loss = self.policy.cost_critic.loss(*taken, *targets)
         _minimize((mean_loss + variance_loss).mean(), self.policy.cost_critic.optimizer)
         return {"cost_critic_loss": mean_loss.mean().item(), "cost_var_loss": variance_loss.mean().item()}

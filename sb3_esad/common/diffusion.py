@@ -1,0 +1,174 @@
+"""What a Gaussian cannot expect, such as a car that turns left or right: its prior refined by a few steps of diffusion."""
+
+import math
+from typing import Any
+
+import torch as th
+
+from sb3_esad.common.checks import require
+from sb3_esad.common.denoiser import Denoiser
+from sb3_esad.common.latents import Gaussian, GaussianHead
+from sb3_esad.common.torch_layers import GridShape
+from sb3_esad.common.type_aliases import Logs
+
+LEVEL_RATIO = 0.4
+"""Of each noise level to the one before."""
+MEMORY = 0.99
+"""Of the running averages, per update."""
+
+
+def noise_levels(start: float | th.Tensor, steps: int) -> list[th.Tensor]:
+    """
+    Levels from which a sampler takes its steps.
+
+    :param start: the highest standard deviation
+    :param steps: K
+    :return: K falling standard deviations
+    """
+    return [th.as_tensor(start * LEVEL_RATIO**step) for step in range(steps)]
+
+
+def gaussian_denoiser(noisy: th.Tensor, level: th.Tensor, variance: th.Tensor) -> th.Tensor:
+    """
+    Best estimate of a residual that is Gaussian around zero.
+
+    :param noisy: residual plus noise, of shape (N, C, H, W)
+    :param level: standard deviation of the noise
+    :param variance: of the residual, of the shape of ``noisy``
+    :return: the estimate, of the same shape
+    """
+    return variance / (variance + level**2) * noisy
+
+
+class DiffusionHead(GaussianHead):
+    """
+    Gaussian prior and posterior, and a diffusion model of what lies between their means.
+
+    The model learns the residual r = mu_q - mu_p from noisy copies of it (EDM, arXiv 2206.00364), as a function of the memory
+    and, in half of the cases, of the observation. Samples of the prior start from the Gaussian's own, noised, and take
+    ``diffusion_steps`` steps that end at the posterior's spread and not at zero: few steps from little noise are worth more
+    than few steps from pure noise (truncated diffusion). It is learned beside the Gaussians, which never see its gradient.
+
+    Until the denoiser foresees residuals better than the Gaussian's own optimal denoiser, the head samples as a
+    :class:`GaussianHead`; with 0 steps it is one.
+
+    :param memory_shape: shape of the memory (C, H, W)
+    :param embedding_channels: channels of the observation's features
+    :param latent_channels: channels of the latent
+    :param hidden_channels: units of the hidden layers in each cell
+    :param diffusion_steps: K, steps of a sample
+    :param start_level: noise that a sample of the prior starts with, in root mean squares of the residual
+    :param kwargs: see :class:`GaussianHead`
+    :raises ValueError: if ``diffusion_steps`` or ``start_level`` is out of its range
+    """
+
+    residual_scale: th.Tensor
+    posterior_std: th.Tensor
+    advantage: th.Tensor
+
+    def __init__(
+        self,
+        memory_shape: GridShape,
+        embedding_channels: int,
+        latent_channels: int,
+        hidden_channels: int,
+        diffusion_steps: int = 2,
+        start_level: float = 3.0,
+        **kwargs: Any,
+    ) -> None:
+        super().__init__(memory_shape, embedding_channels, latent_channels, hidden_channels, **kwargs)
+        require(diffusion_steps >= 0, "diffusion_steps", diffusion_steps, "a number of steps >= 0, 0 for a Gaussian latent")
+        require(start_level > 0, "start_level", start_level, "a multiple > 0")
+        self.diffusion_steps = diffusion_steps
+        self.start_level = start_level
+        with th.random.fork_rng(devices=[]):  # so that all other networks begin as they would without a denoiser
+            self.denoiser = Denoiser(memory_shape, hidden_channels, latent_channels, hidden_channels)
+        self.register_buffer("residual_scale", th.tensor(0.1))
+        self.register_buffer("posterior_std", th.ones(latent_channels, *memory_shape[1:]))
+        self.register_buffer("advantage", th.tensor(-1.0))
+
+    @property
+    def refines(self) -> bool:
+        """Whether samples are refined: the denoiser has become better than a Gaussian."""
+        return self.diffusion_steps > 0 and bool(self.advantage > 0)
+
+    def sample(
+        self,
+        memory: th.Tensor,
+        embedding: th.Tensor | None = None,
+        n_candidates: int = 1,
+        generator: th.Generator | None = None,
+    ) -> th.Tensor:
+        if not self.refines:
+            return super().sample(memory, embedding, n_candidates, generator)
+        prior = self.prior(memory)
+        context = self.denoiser.context(memory, embedding)
+        start = self.residual_scale * (self.start_level if embedding is None else 1.0)
+        centre, variance = th.zeros_like(prior.mean), (prior.std.square() - self.posterior_std.square()).clamp(min=0)
+        if embedding is not None:
+            centre, variance = self.posterior(memory, embedding).mean - prior.mean, th.zeros_like(centre)
+        fields = (prior.mean, context, centre, (variance + start**2).sqrt())
+        mean, context, centre, spread = (th.cat([field] * n_candidates) for field in fields)
+        return mean + self._refine(Gaussian(centre, spread).sample(generator), context, start, generator)
+
+    def _refine(self, noisy: th.Tensor, context: th.Tensor, start: th.Tensor, generator: th.Generator | None) -> th.Tensor:
+        """Euler's steps from one noise level to the next; the last one ends at the spread of the posterior."""
+        levels = noise_levels(start, self.diffusion_steps)
+        for level, following in zip(levels, [*levels[1:], self.posterior_std], strict=True):
+            clean = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
+            end = th.minimum(following, level)
+            noisy = clean + end / level * (noisy - clean)
+        missing = (self.posterior_std.square() - end.square()).sqrt()  # where latents are vaguer than where the sample began
+        return Gaussian(noisy, missing).sample(generator)
+
+    def loss(
+        self,
+        posterior: Gaussian,
+        prior: Gaussian,
+        memory: th.Tensor,
+        embedding: th.Tensor,
+        generator: th.Generator | None = None,
+    ) -> tuple[th.Tensor, Logs]:
+        loss, logs = super().loss(posterior, prior, memory, embedding, generator)
+        if self.diffusion_steps == 0:
+            return loss, logs
+        posterior, prior = (Gaussian(*(field.detach().flatten(end_dim=-4) for field in each)) for each in (posterior, prior))
+        memory, embedding = (field.detach().flatten(end_dim=-4) for field in (memory, embedding))
+        residual = posterior.mean - prior.mean
+        self._follow(posterior, residual)
+        self._judge(prior, residual, memory, generator)
+        diffusion = self._denoising_loss(residual, memory, embedding, generator)
+        scales = {"residual_scale": self.residual_scale.item(), "diffusion_advantage": self.advantage.item()}
+        return loss + diffusion, {**logs, "diffusion_loss": diffusion.item(), **scales}
+
+    def _denoising_loss(
+        self, residual: th.Tensor, memory: th.Tensor, embedding: th.Tensor, generator: th.Generator | None
+    ) -> th.Tensor:
+        """Squared error of the denoiser on noised residuals, in the units of its last layer (EDM, Eq. 8)."""
+        n, device = len(residual), residual.device
+        exponent = math.log(2.5) + 1.2 * th.randn(n, device=device, generator=generator)
+        level = self.residual_scale * exponent.exp().clamp(0.05, 10)
+        seen = th.rand(n, device=device, generator=generator) < 0.5
+        context = self.denoiser.context(memory, th.where(seen[:, None, None, None], embedding, 0.0))
+        noisy = Gaussian(residual, level[:, None, None, None].expand_as(residual)).sample(generator)
+        error = self.denoiser(noisy, level, self.residual_scale, context) - residual
+        weight = (level**2 + self.residual_scale**2) / (level * self.residual_scale) ** 2
+        return (weight * error.square().mean((-3, -2, -1))).mean()
+
+    @th.no_grad()
+    def _follow(self, posterior: Gaussian, residual: th.Tensor) -> None:
+        """Move the running averages of sigma_d and sigma_q."""
+        self.residual_scale.lerp_(residual.square().mean().sqrt(), 1 - MEMORY)
+        self.posterior_std.lerp_(posterior.std.mean(0), 1 - MEMORY)
+
+    @th.no_grad()
+    def _judge(self, prior: Gaussian, residual: th.Tensor, memory: th.Tensor, generator: th.Generator | None) -> None:
+        """Compare the denoiser with the Gaussian's own where samples start, on states that it has not been fitted to yet."""
+        level = self.residual_scale * self.start_level
+        noisy = Gaussian(residual, level.expand_as(residual)).sample(generator)
+        context = self.denoiser.context(memory, None)
+        learned = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
+        variance = (prior.std.square() - self.posterior_std.square()).clamp(min=0)
+        assumed = gaussian_denoiser(noisy, level, variance)
+        errors = [(estimate - residual).square().mean() for estimate in (learned, assumed)]
+        self.advantage.lerp_(1 - errors[0] / errors[1], 1 - MEMORY)

@@ -1,0 +1,83 @@
+"""Where an action leads: a few imagined steps, judged by the critics at their end."""
+
+from typing import NamedTuple
+
+import torch as th
+
+from sb3_esad.common.agent import LatentAgent
+from sb3_esad.common.functional import barrier_residual
+from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns
+from sb3_esad.common.type_aliases import LatentState
+
+
+class Outlook(NamedTuple):
+    """
+    What is expected of actions.
+
+    :param values: return to come
+    :param risks: Gamma, the conditional value at risk of the cost to come
+    :param next_risks: Gamma where they lead to in m steps
+    """
+
+    values: th.Tensor
+    risks: th.Tensor
+    next_risks: th.Tensor
+
+
+class Foresight:
+    """
+    Imagines an action and what the actor would do after it.
+
+    The cost to come is that of the imagined steps and of the critic at their end, as in training: what a single action does,
+    critics see less well than a world model (docs/experiments.md, section 5).
+
+    :param steps: m, imagined steps
+    :param gamma: discount of the return
+    :param cost_gamma: discount of the cost
+    :param risk_level: worst fraction of outcomes
+    :param barrier_decay: alpha_b, how fast the risk must return to the budget
+    """
+
+    def __init__(self, steps: int, gamma: float, cost_gamma: float, risk_level: float, barrier_decay: float) -> None:
+        self.steps = steps
+        self.gamma = gamma
+        self.cost_gamma = cost_gamma
+        self.risk_level = risk_level
+        self.barrier_decay = barrier_decay
+
+    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
+        """
+        Look ahead.
+
+        :param agent: whose networks imagine and judge
+        :param start: N states and the actions taken in them
+        :return: fields of shape (N,)
+        """
+        imagined = agent.world_model.imagine(start, lambda grid: agent.actor(grid, deterministic=True), self.steps, self.gamma)
+        values = imagined_returns(agent.critic, imagined, self.gamma, lambda_=1.0)[0]
+        costs = imagined_costs(agent.cost_critic, imagined, self.cost_gamma, lambda_=1.0)[0]
+        _, variance = agent.cost_critic(imagined.grids[0], imagined.actions[0])
+        risks = agent.cost_critic.risk(costs[None], variance, self.risk_level)
+        return Outlook(values, risks, self.risk(agent, imagined.grids[-1], imagined.actions[-1]))
+
+    def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        """
+        Safety measure Gamma of actions, as the critics see it.
+
+        :param agent: whose critics judge
+        :param grids: features of N states, of shape (N, C, H, W)
+        :param actions: shape (N, A)
+        :return: shape (N,)
+        """
+        means, variance = agent.cost_critic(grids, actions)
+        return agent.cost_critic.risk(means, variance, self.risk_level)
+
+    def barrier(self, outlook: Outlook, budget: float) -> th.Tensor:
+        """
+        By how much the barrier condition is violated.
+
+        :param outlook: of actions
+        :param budget: d, the discounted budget
+        :return: residual, <= 0 where the condition holds, of the shape of its fields
+        """
+        return barrier_residual(outlook.next_risks, outlook.risks, budget, self.barrier_decay)

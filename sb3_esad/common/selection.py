@@ -1,0 +1,204 @@
+"""Which action is executed: the one that the actor proposes, or a safer one."""
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch as th
+
+from sb3_esad.common.agent import LatentAgent
+from sb3_esad.common.foresight import Foresight, Outlook
+from sb3_esad.common.penalties import Penalty
+from sb3_esad.common.precision import autocast
+from sb3_esad.common.type_aliases import Belief, LatentState, Logs
+
+UNIFORM_PROPOSALS, BEST_UNIFORM = 64, 4
+"""Uniform actions that are judged by the critics alone, and how many of them are proposals."""
+
+
+class Selection(NamedTuple):
+    """
+    What is executed in N states.
+
+    :param actions: scaled to [-1, 1], of shape (N, A)
+    :param intervened: whether the proposed action was replaced, of shape (N,)
+    :param helpless: whether nothing was admissible and the action of least risk was taken, of shape (N,)
+    """
+
+    actions: th.Tensor
+    intervened: th.Tensor
+    helpless: th.Tensor
+
+
+class SelectionRates:
+    """How often actions have been replaced lately."""
+
+    def __init__(self) -> None:
+        self._selections: list[Selection] = []
+
+    def note(self, selection: Selection) -> None:
+        """
+        Take note of one step.
+
+        :param selection: of that step
+        """
+        self._selections.append(selection)
+
+    def take(self) -> Logs:
+        """
+        Hand over the rates since the last call.
+
+        :return: shares of the actions, empty if there were none
+        """
+        selections, self._selections = self._selections, []
+        if not selections:
+            return {}
+        rates = {
+            "intervention_rate": [each.intervened for each in selections],
+            "fallback_rate": [each.helpless for each in selections],
+        }
+        return {name: th.cat(flags).float().mean().item() for name, flags in rates.items()}
+
+
+def draw_scenarios(agent: LatentAgent, belief: Belief, n: int) -> LatentState:
+    """
+    Draw what may be the case: latents of the same memory.
+
+    :param agent: whose world model draws
+    :param belief: N states and their observations
+    :param n: M, how many for each state, the latent of the state itself first
+    :return: fields of shape (M, N, ...)
+    """
+    state = belief.state
+    others = agent.world_model.rssm.head.sample(state.memory, belief.embedding, n - 1) if n > 1 else state.latent[:0]
+    latents = th.cat([state.latent, others]).unflatten(0, (n, -1))
+    return LatentState(state.memory.expand(n, *state.memory.shape), latents, state.action.expand(n, *state.action.shape))
+
+
+class ActionFilter(ABC):
+    """
+    Last word on the action to execute.
+
+    :param settings: of the filter
+    """
+
+    @abstractmethod
+    def __init__(self, **settings: Any) -> None: ...
+
+    @abstractmethod
+    def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
+        """
+        Decide what is executed.
+
+        :param agent: whose world model and critics judge
+        :param belief: N states and their observations
+        :param proposed: the actor's actions, of shape (N, A)
+        :return: the actions to execute
+        """
+
+
+class NoFilter(ActionFilter):
+    """
+    Whatever is proposed is executed.
+
+    :param settings: those of :class:`SafetyFilter`, so that either can be built by the same call; ignored
+    """
+
+    def __init__(self, **settings: Any) -> None:
+        pass
+
+    def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
+        never = th.zeros(len(proposed), dtype=th.bool, device=proposed.device)
+        return Selection(proposed, never, never)
+
+
+class SafetyFilter(ActionFilter):
+    """
+    Replaces an action that is not admissible by the most promising one that is, or else by the least risky one.
+
+    Latents drawn from P(z | h, o) are scenarios: an action is as risky as in the worst of them. To choose among latents, as in
+    figure 3 of arXiv 2407.06317, would be to choose the world in which there is no car.
+
+    :param penalty: tells what is admissible
+    :param is_active: whether the critics may be trusted with that
+    :param foresight: imagines where an action leads
+    :param risk_level: fraction of the worst scenarios that counts
+    :param n_candidates: scenarios
+    :param n_proposals: actions to choose from where the actor's own is not admissible
+    """
+
+    def __init__(
+        self,
+        penalty: Penalty,
+        is_active: Callable[[], bool],
+        foresight: Foresight,
+        risk_level: float,
+        n_candidates: int = 8,
+        n_proposals: int = 16,
+    ) -> None:
+        self.penalty = penalty
+        self.is_active = is_active
+        self.foresight = foresight
+        self.risk_level = risk_level
+        self.n_candidates = n_candidates
+        self.n_proposals = n_proposals
+
+    @th.no_grad()
+    def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
+        if not self.is_active():
+            return NoFilter().select(agent, belief, proposed)
+        with autocast(proposed.device):
+            scenarios = draw_scenarios(agent, belief, self.n_candidates)
+            doubtful = ~self._admissible(self.assess(agent, scenarios, proposed[None]))[0]
+            actions, helpless = proposed.clone(), th.zeros_like(doubtful)
+            if doubtful.any():
+                chosen = scenarios.map(lambda field: field[:, doubtful])
+                state = belief.state.map(lambda field: field[doubtful])
+                actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful])
+        return Selection(actions, (actions != proposed).any(1), helpless)
+
+    def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> Outlook:
+        """
+        Foresee where actions lead, on average over the scenarios as to the return, in the worst of them as to the risk.
+
+        :param agent: whose world model and critics judge
+        :param scenarios: fields of shape (M, N, ...)
+        :param proposals: P actions for each of N states, of shape (P, N, A)
+        :return: fields of shape (P, N)
+        """
+        n_proposals, n_states = proposals.shape[:2]
+        n_scenarios = len(scenarios.memory)
+        states = scenarios.map(lambda field: field.repeat(n_proposals, *[1] * (field.dim() - 1)).flatten(0, 1))
+        actions = proposals.repeat_interleave(n_scenarios, 0).flatten(0, 1)
+        outlook = self.foresight(agent, states._replace(action=actions))
+        values, risks, next_risks = (field.view(n_proposals, n_scenarios, n_states) for field in outlook)
+        n_worst = math.ceil(self.risk_level * n_scenarios)
+        worst, following = (each.topk(n_worst, dim=1).values.mean(1) for each in (risks, next_risks))
+        return Outlook(values.mean(1), worst, following)
+
+    def _admissible(self, outlook: Outlook) -> th.Tensor:
+        return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget))
+
+    def _choose(
+        self, agent: LatentAgent, scenarios: LatentState, state: LatentState, proposed: th.Tensor
+    ) -> tuple[th.Tensor, th.Tensor]:
+        proposals = self._proposals(agent, state, proposed)
+        outlook = self.assess(agent, scenarios, proposals)
+        admissible = self._admissible(outlook)
+        helpless = ~admissible.any(0)
+        promising = outlook.values.masked_fill(~admissible, -math.inf).argmax(0)
+        best = th.where(helpless, outlook.risks.argmin(0), promising)
+        return proposals[best, th.arange(len(proposed), device=best.device)], helpless
+
+    def _proposals(self, agent: LatentAgent, state: LatentState, proposed: th.Tensor) -> th.Tensor:
+        """The proposed action, samples of the actor, and those of many uniform actions that the critics fear least."""
+        n_states, size = proposed.shape
+        grids = agent.world_model.features(state)
+        uniform = 2 * th.rand(UNIFORM_PROPOSALS, n_states, size, device=proposed.device) - 1
+        fears = self.foresight.risk(agent, grids.repeat(UNIFORM_PROPOSALS, 1, 1, 1), uniform.flatten(0, 1))
+        least = fears.view(UNIFORM_PROPOSALS, n_states).topk(BEST_UNIFORM, dim=0, largest=False).indices
+        calm = uniform.gather(0, least[..., None].expand(-1, -1, size))
+        n_samples = self.n_proposals - BEST_UNIFORM - 1
+        samples = agent.actor(grids.repeat(n_samples, 1, 1, 1)).view(n_samples, n_states, size)
+        return th.cat([proposed[None], samples, calm])

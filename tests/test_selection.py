@@ -1,0 +1,194 @@
+"""The last word on the action: a filter whose judgement is known, and the drive that it changes."""
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch as th
+
+from sb3_esad import ADEND, ESADLEND
+from sb3_esad.common.agent import LatentAgent
+from sb3_esad.common.foresight import Foresight, Outlook
+from sb3_esad.common.functional import barrier_residual
+from sb3_esad.common.multipliers import AugmentedLagrangian
+from sb3_esad.common.penalties import NoPenalty
+from sb3_esad.common.selection import ActionFilter, NoFilter, SafetyFilter, Selection
+from sb3_esad.common.type_aliases import Belief, LatentState
+from tests.conftest import TINY, CountingEnv
+
+BUDGET_SCALE = AugmentedLagrangian(cost_limit=0.05).budget_scale
+
+
+class Known(Foresight):
+    """An action a is worth a and as risky as (a - calm)^2, more in vague worlds; where it leads to nothing is at risk."""
+
+    def __init__(self, calm: float) -> None:
+        super().__init__(steps=1, gamma=0.9, cost_gamma=0.9, risk_level=0.5, barrier_decay=0.3)
+        self.calm = calm
+
+    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
+        action = start.action[:, 0]
+        return Outlook(action, self.at(action) * start.memory[:, 0, 0, 0], th.zeros_like(action))
+
+    def at(self, action: th.Tensor) -> th.Tensor:
+        return (action - self.calm).square()
+
+    def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return self.at(actions[:, 0])
+
+
+@pytest.fixture
+def agent() -> LatentAgent:
+    return ESADLEND("MlpPolicy", CountingEnv(), **TINY).policy.average
+
+
+def belief(agent: LatentAgent, n: int) -> Belief:
+    state = agent.world_model.initial(n)
+    return Belief(state._replace(memory=th.ones_like(state.memory)), th.zeros(n, 8, 1, 1))
+
+
+def make_filter(calm: float, active: bool = True, **settings: Any) -> SafetyFilter:
+    penalty = AugmentedLagrangian(cost_limit=0.05)
+    return SafetyFilter(penalty, lambda: active, Known(calm), risk_level=0.5, **settings)
+
+
+def test_what_is_admissible_is_executed_as_it_is(agent: LatentAgent) -> None:
+    proposed = 0.2 + 0.9 * math.sqrt(BUDGET_SCALE) * th.tensor([[-1.0], [0.5], [1.0]])
+    selection = make_filter(calm=0.2).select(agent, belief(agent, 3), proposed)
+    assert th.equal(selection.actions, proposed)
+    assert not selection.intervened.any() and not selection.helpless.any()
+
+
+def test_only_what_is_not_admissible_is_replaced_by_the_best_that_is(agent: LatentAgent) -> None:
+    proposed = th.tensor([[0.2], [-0.9]])
+    selection = make_filter(calm=0.2).select(agent, belief(agent, 2), proposed)
+    assert selection.intervened.tolist() == [False, True] and not selection.helpless.any()
+    assert selection.actions[0] == proposed[0]
+    assert Known(0.2).at(selection.actions[1]) <= BUDGET_SCALE
+
+
+def test_the_choice_is_that_of_brute_force(agent: LatentAgent) -> None:
+    n = 6
+    safety = make_filter(calm=0.2, n_proposals=40)
+    seen = belief(agent, n)
+    th.manual_seed(3)
+    proposals = safety._proposals(agent, seen.state, th.full((n, 1), -0.9))
+    assert proposals.shape == (40, n, 1)
+    th.manual_seed(3)
+    actions, helpless = safety._choose(agent, seen.state.map(lambda field: field[None]), seen.state, th.full((n, 1), -0.9))
+    for state in range(n):
+        candidates = proposals[:, state, 0].tolist()
+        admissible = [a for a in candidates if (a - 0.2) ** 2 <= BUDGET_SCALE]
+        expected = max(admissible) if admissible else min(candidates, key=lambda a: (a - 0.2) ** 2)
+        assert actions[state].item() == pytest.approx(expected)
+        assert helpless[state].item() == (not admissible)
+
+
+def test_where_nothing_is_admissible_the_least_risk_is_taken(agent: LatentAgent) -> None:
+    safety = make_filter(calm=5.0)
+    selection = safety.select(agent, belief(agent, 4), th.zeros(4, 1))
+    assert selection.helpless.all() and selection.intervened.all()
+    assert (selection.actions > 0.8).all()  # of 64 uniform actions the highest four
+
+
+@pytest.mark.parametrize(("risk_level", "expected"), [(0.25, 4.0), (0.5, 3.5), (0.6, 3.0), (1.0, 2.5)])
+def test_an_action_is_as_risky_as_in_its_worst_scenarios(agent: LatentAgent, risk_level: float, expected: float) -> None:
+    safety = SafetyFilter(AugmentedLagrangian(0.05), lambda: True, Known(0.0), risk_level, n_candidates=4)
+    state = agent.world_model.initial(2).map(lambda field: field.expand(4, *field.shape))
+    vague = th.tensor([3.0, 1.0, 4.0, 2.0]).view(4, 1, 1, 1, 1)
+    outlook = safety.assess(agent, state._replace(memory=state.memory + vague), th.ones(3, 2, 1))
+    th.testing.assert_close(outlook.risks, th.full((3, 2), expected))
+
+
+@pytest.mark.parametrize("passive", [NoFilter(), make_filter(calm=5.0, active=False)])
+def test_a_filter_that_is_not_to_be_trusted_changes_nothing(agent: LatentAgent, passive: ActionFilter) -> None:
+    proposed = 2 * th.rand(4, 1) - 1
+    selection = passive.select(agent, belief(agent, 4), proposed)
+    assert th.equal(selection.actions, proposed) and not selection.intervened.any()
+
+
+def test_without_a_limit_everything_is_admissible(agent: LatentAgent) -> None:
+    safety = SafetyFilter(NoPenalty(), lambda: True, Known(5.0), risk_level=0.5)
+    proposed = 2 * th.rand(4, 1) - 1
+    assert th.equal(safety.select(agent, belief(agent, 4), proposed).actions, proposed)
+
+
+def test_foresight_is_what_model_and_critics_say(agent: LatentAgent) -> None:
+    """One imagined step by hand; the prior is made certain, so that it is the same each time."""
+    agent.world_model.rssm.head.prior_net[1].bias.data[4:] = -100.0
+    state = agent.world_model.initial(3)._replace(action=2 * th.rand(3, 1) - 1)
+    foresight = Foresight(steps=1, gamma=0.9, cost_gamma=0.8, risk_level=1.0, barrier_decay=0.3)
+    th.manual_seed(0)
+    outlook = foresight(agent, state)
+    th.manual_seed(0)
+    grid = agent.world_model.features(agent.world_model.rssm.imagine(state))
+    rewards, costs, continues = (field[0] for field in agent.world_model.predict(grid[None]))
+    action = agent.actor(grid, deterministic=True)
+    th.testing.assert_close(outlook.values, rewards + 0.9 * continues * agent.critic(grid, action).min(0).values)
+    means, _ = agent.cost_critic(grid, action)
+    th.testing.assert_close(outlook.risks, costs + 0.8 * continues * means.max(0).values)
+    th.testing.assert_close(outlook.next_risks, means.max(0).values)
+    expected = barrier_residual(outlook.next_risks, outlook.risks, 0.1, 0.3)
+    th.testing.assert_close(foresight.barrier(outlook, 0.1), expected)
+
+
+class Always(ActionFilter):
+    """Executes the same action whatever is proposed."""
+
+    def __init__(self, **settings: Any) -> None:
+        pass
+
+    def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
+        replaced = th.ones(len(proposed), dtype=th.bool)
+        return Selection(th.full_like(proposed, 0.25), replaced, ~replaced)
+
+
+class Obstinate(ESADLEND):
+    filter_class = Always
+
+
+def test_what_is_executed_is_stored_remembered_and_counted() -> None:
+    model = Obstinate("MlpPolicy", CountingEnv(), **TINY).learn(30)
+    actions = model.replay_buffer.actions[:30, 0, 0]
+    assert (actions[:20] != 0.25).all() and (actions[20:] == 0.25).all()
+    assert model._last_latent is not None and (model._last_latent.action == 0.25).all()
+    assert model.predict(np.zeros(1, dtype=np.float32))[0] == 0.25
+    assert model._selections.take() == {"intervention_rate": 1.0, "fallback_rate": 0.0}
+    assert model._selections.take() == {}
+
+
+def test_nothing_is_filtered_without_a_limit_or_a_filter() -> None:
+    for model in (
+        ESADLEND("MlpPolicy", CountingEnv(), **TINY, cost_limit=None),
+        ESADLEND("MlpPolicy", CountingEnv(), **TINY, filter_start=None),
+        ADEND("MlpPolicy", CountingEnv(), **TINY),
+    ):
+        assert isinstance(model.policy.action_filter, NoFilter)
+
+
+def test_the_filter_waits_for_updates_and_for_critics_that_can_be_trusted() -> None:
+    model = ESADLEND("MlpPolicy", CountingEnv(), **TINY, filter_start=5)
+    model.penalty = NoPenalty()  # always calibrated
+    assert not model._filter_is_active()
+    model._n_updates = 5
+    assert model._filter_is_active()
+    model.penalty = AugmentedLagrangian(0.05)
+    assert not model._filter_is_active()
+
+
+def test_predictions_by_a_filter_are_the_same_again_and_after_loading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(AugmentedLagrangian, "calibrated", True)
+    model = ESADLEND("MlpPolicy", CountingEnv(), **TINY, filter_start=0, cost_limit=0.0).learn(30)
+    observations = np.random.rand(5, 1).astype(np.float32)
+    first, _ = model.predict(observations, deterministic=True)
+    th.rand(7)  # other random numbers in between change nothing
+    model.save(tmp_path / "model")
+    again, _ = model.predict(observations, deterministic=True)
+    loaded, _ = ESADLEND.load(tmp_path / "model").predict(observations, deterministic=True)
+    np.testing.assert_array_equal(first, again)
+    np.testing.assert_allclose(first, loaded, rtol=1e-6)
+    agent, starts = model.policy.average, th.ones(5, dtype=th.bool)
+    seen = agent.observe(th.as_tensor(observations), model.policy.initial_state(5), starts, True)
+    assert not np.allclose(first, agent.act(seen.state, True).numpy()), "the filter has not intervened"
