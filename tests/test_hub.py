@@ -5,6 +5,7 @@ import io
 import json
 import zipfile
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from test_zoo import ENV, settings, train
 from sb3_esad import ESADLEND
 from sb3_esad.__main__ import main
 from sb3_esad.algorithms import ALGORITHMS
+from sb3_esad.report import summarise_any
 from sb3_esad.zoo.agents import Agent, EnvironmentName
 from sb3_esad.zoo.card import model_card
 from tests.local_hub import LocalHub, serving
@@ -32,14 +34,21 @@ IMAGES = "zoo-images-v0"
 gym.register(IMAGES, "sb3_esad.envs.highway:Highway", disable_env_checker=True, kwargs={"config": {"duration": 2.0}})
 
 
+@contextmanager
+def reached_by_its_client(cache: Path) -> Iterator[LocalHub]:
+    """A stand-in for the Hub that takes its place."""
+    with serving(TOKEN) as hub, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(constants, "ENDPOINT", hub.url)
+        patch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", hub.url + "/{repo_id}/resolve/{revision}/{filename}")
+        patch.setattr(constants, "HF_HUB_DISABLE_XET", True)  # a protocol of its own for large files
+        patch.setattr(constants, "HF_HUB_CACHE", str(cache))
+        patch.setenv("HF_TOKEN", TOKEN)
+        yield hub
+
+
 @pytest.fixture
-def hub(monkeypatch: pytest.MonkeyPatch, tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalHub]:
-    with serving(TOKEN) as hub:
-        monkeypatch.setattr(constants, "ENDPOINT", hub.url)
-        monkeypatch.setattr(constants, "HUGGINGFACE_CO_URL_TEMPLATE", hub.url + "/{repo_id}/resolve/{revision}/{filename}")
-        monkeypatch.setattr(constants, "HF_HUB_DISABLE_XET", True)  # a protocol of its own for large files
-        monkeypatch.setattr(constants, "HF_HUB_CACHE", str(tmp_path_factory.mktemp("cache")))
-        monkeypatch.setenv("HF_TOKEN", TOKEN)
+def hub(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LocalHub]:
+    with reached_by_its_client(tmp_path_factory.mktemp("cache")) as hub:
         yield hub
 
 
@@ -58,9 +67,18 @@ def pull(folder: Path, *words: str) -> int:
     return main(["load_from_hub", *AGENT, "-f", str(folder), "-orga", "me", *words])
 
 
+@pytest.fixture(scope="module")
+def shared(logs: Path, tmp_path_factory: pytest.TempPathFactory) -> dict[str, bytes]:
+    """Files of the agent as it is shared."""
+    with reached_by_its_client(tmp_path_factory.mktemp("cache")) as hub:
+        assert push(logs, "--no-render") == 0
+        return hub.files[REPOSITORY]
+
+
 @pytest.fixture
-def pushed(hub: LocalHub, logs: Path) -> dict[str, bytes]:
-    assert push(logs, "--no-render") == 0
+def pushed(hub: LocalHub, shared: dict[str, bytes]) -> dict[str, bytes]:
+    """The same on a hub of their own, where they can be changed."""
+    hub.files[REPOSITORY] = dict(shared)
     return hub.files[REPOSITORY]
 
 
@@ -133,8 +151,6 @@ def test_the_card(pushed: dict[str, bytes]) -> None:
     ],
 )
 def test_the_card_claims_no_more_than_the_episodes_show(limit: float | None, costs: list[int], sentence: str) -> None:
-    from sb3_esad.report import summarise_any
-
     model = ESADLEND("MlpPolicy", "Pendulum-v1", cost_limit=limit, buffer_size=100)
     figures = summarise_any([{"return": 1.0, "cost": cost, "steps": 5.0} for cost in costs])
     agent = Agent("esad_lend", EnvironmentName("Pendulum-v1"), Path("a.zip"), Path(), {}, {"g": 9.8})
