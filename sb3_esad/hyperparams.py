@@ -150,7 +150,9 @@ def constructor_arguments(algorithm: type[BaseAlgorithm]) -> set[str]:
     :return: their names, without ``env`` and private ones
     """
     names: set[str] = set()
-    for each in (each for each in algorithm.__mro__ if "__init__" in vars(each)):
+    for each in algorithm.__mro__:
+        if "__init__" not in vars(each):
+            continue
         parameters = inspect.signature(each).parameters.values()
         names |= {parameter.name for parameter in parameters if parameter.kind in NAMED}
         passes_on = any(parameter.kind is Parameter.VAR_KEYWORD for parameter in parameters)

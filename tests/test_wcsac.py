@@ -12,6 +12,7 @@ from gymnasium import spaces
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import StopTrainingOnMaxEpisodes
 from stable_baselines3.common.envs import FakeImageEnv, IdentityEnv
+from stable_baselines3.common.torch_layers import NatureCNN
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 from stable_baselines3.her import HerReplayBuffer
 
@@ -19,6 +20,7 @@ from sb3_esad import ESADLEND, WCSAC, SACLag
 from sb3_esad.common import functional
 from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.evaluation import evaluate_policy
+from sb3_esad.common.extractors import SpatialCnn
 from sb3_esad.wcsac import CnnPolicy, MlpPolicy, MultiInputPolicy
 from tests.conftest import PICTURE, VECTOR, CountingEnv, RandomEnv
 from tests.conftest import TINY as TINY_LATENT
@@ -243,6 +245,16 @@ def test_policies(policy: str, n_envs: int) -> None:
     model.learn(8)
     action, _ = model.predict(SPACES[policy].sample(), deterministic=True)
     assert model.action_space.contains(action)
+
+
+def test_any_features_extractor() -> None:
+    """Those of SB3 by default; each network has its own."""
+    model = make_model("CnnPolicy")
+    extractors = [each.features_extractor for each in (model.actor, model.critic, model.policy.cost_critic.features.readout)]
+    assert {type(each) for each in extractors} == {NatureCNN} and len(set(map(id, extractors))) == 3
+    policy_kwargs = {"net_arch": [8], "features_extractor_class": SpatialCnn, "features_extractor_kwargs": {"channels": 4}}
+    model = make_model("CnnPolicy", train_freq=4, policy_kwargs=policy_kwargs).learn(16)
+    assert isinstance(model.policy.cost_critic.features.readout.features_extractor, SpatialCnn)
 
 
 def test_stacked_frames() -> None:

@@ -8,7 +8,6 @@ from gymnasium import spaces
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_esad.common.cost_buffers import CostBuffer
-from sb3_esad.common.frames import ObservationArray
 from sb3_esad.common.type_aliases import SequenceSamples
 from sb3_esad.common.windows import WindowIndex, event_weights, time_to_event
 
@@ -74,17 +73,14 @@ class SequenceReplayBuffer(CostBuffer):
         super().reset()
         self._windows = None
 
-    def add(
-        self,
-        obs: ObservationArray,
-        next_obs: ObservationArray,
-        action: np.ndarray,
-        reward: np.ndarray,
-        done: np.ndarray,
-        infos: list[dict[str, Any]],
-    ) -> None:
-        """See :meth:`CostBuffer.add`."""
-        super().add(obs, next_obs, action, reward, done, infos)
+    def add(self, *args: Any, **kwargs: Any) -> None:
+        """
+        Store one step of all environments.
+
+        :param args: see :meth:`CostBuffer.add`
+        :param kwargs: likewise
+        """
+        super().add(*args, **kwargs)
         self._windows = None
 
     def sample(self, batch_size: int, env: VecNormalize | None = None) -> SequenceSamples:  # type: ignore[override]

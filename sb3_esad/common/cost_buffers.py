@@ -16,7 +16,7 @@ from sb3_esad.common.type_aliases import CostReplaySamples
 
 class CostBuffer(ReplayBuffer):
     """
-    Steps with their costs, as SB3's replay buffers hold them, for observations of any space.
+    Base of the replay buffers of this package: steps with their costs, and observations of any space.
 
     Each frame is stored once, for ``next_obs`` of a step is ``obs`` of the next one; only the last frame of an episode, which
     the reset hides, and the newest ``next_obs`` are stored apart. If ``obs`` does not continue the previous step although that

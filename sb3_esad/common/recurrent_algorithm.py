@@ -58,7 +58,7 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
 
     saved_marks = ("random_hold",)
     buffer_class = SequenceReplayBuffer
-    buffer_arguments = ("cost_key", "sequence_length")
+    buffer_arguments = (*CostAwareAlgorithm.buffer_arguments, "sequence_length")
     policy: LatentPolicy
     replay_buffer: SequenceReplayBuffer
     action_space: spaces.Box

@@ -155,27 +155,15 @@ class WCSAC(CostLimitedAlgorithm, SAC):
 
 class SACLag(WCSAC):
     """
-    SAC-Lag: :class:`WCSAC` that limits the mean of the cost, not that of the worst outcomes, unless it is told to.
+    SAC-Lag: :class:`WCSAC` that limits the mean of the cost, not that of its worst outcomes.
 
-    :param policy: see :class:`WCSAC`
-    :param env: likewise
-    :param learning_rate: likewise
-    :param cost_limit: likewise
+    :param args: see :class:`WCSAC`
     :param risk_level: likewise
     :param kwargs: likewise
-    :raises ValueError: likewise
     """
 
-    def __init__(
-        self,
-        policy: str | type[WCSACPolicy],
-        env: GymEnv | str,
-        learning_rate: float | Schedule = 3e-4,
-        cost_limit: float | None = 0.05,
-        risk_level: float = 1.0,
-        **kwargs: Any,
-    ) -> None:
-        super().__init__(policy, env, learning_rate, cost_limit, risk_level, **kwargs)
+    def __init__(self, *args: Any, risk_level: float = 1.0, **kwargs: Any) -> None:
+        super().__init__(*args, risk_level=risk_level, **kwargs)
 
 
 def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
