@@ -103,7 +103,7 @@ def evaluate_model(
     if not seeds:
         raise ValueError("There are no seeds to evaluate; give at least one.")
     n_envs = min(n_envs, len(seeds))
-    make = partial(_make, env_id, cost_key=getattr(model, "cost_key", "cost"), **(env_kwargs or {}))
+    make = partial(_make, env_id, cost_key=getattr(model, "cost_key", "cost"), env_kwargs=env_kwargs)
     dummy_env = DummyVecEnv([partial(make, seeds[first::n_envs]) for first in range(n_envs)])
     envs: list[Any] = dummy_env.envs
     vec_env = stack_frames(BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False), model.observation_space)
@@ -186,5 +186,7 @@ def check_spaces(model: BaseAlgorithm, env: VecEnv | gym.Env[Any, Any], env_id: 
             )
 
 
-def _make(env_id: str, seeds: Sequence[int], cost_key: str = "cost", **env_kwargs: Any) -> SeededEpisodes:
-    return SeededEpisodes(gym.make(env_id, **env_kwargs), seeds, cost_key)
+def _make(
+    env_id: str, seeds: Sequence[int], cost_key: str = "cost", env_kwargs: Mapping[str, Any] | None = None
+) -> SeededEpisodes:
+    return SeededEpisodes(gym.make(env_id, **(env_kwargs or {})), seeds, cost_key)

@@ -310,11 +310,17 @@ def test_what_the_hub_says_is_told(
         assert f"{REPOSITORY}: " in line and status in line and "hf_another" not in line
 
 
-def test_no_hub_within_reach(logs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
-    with serving() as gone:
-        monkeypatch.setattr(constants, "ENDPOINT", gone.url)
-    assert push(logs, "--no-render") == 2
-    assert capsys.readouterr().err.splitlines()[-1].startswith(f"sb3_esad push_to_hub: {REPOSITORY}: ")
+def test_no_hub_within_reach(hub: LocalHub, logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    hub.shutdown()
+    hub.server_close()
+    for command in (lambda: push(logs, "--no-render"), lambda: pull(tmp_path)):
+        assert command() == 2
+        assert f"_hub: {REPOSITORY}: " in capsys.readouterr().err.splitlines()[-1]
+
+
+def test_senseless_numbers_are_refused(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert push(logs, "--episodes", "0") == 2
+    assert capsys.readouterr().err == "sb3_esad push_to_hub: episodes is 0; choose a number >= 1.\n"
 
 
 @pytest.mark.parametrize("algo", ALGORITHMS)

@@ -59,6 +59,7 @@ def find_agent(args: Namespace) -> Agent:
     if not config["normalize"]:
         del config["normalize"]  # which RL Zoo adds
     config.pop("env_kwargs", None)
+    # Written by RL Zoo on this machine, or by load_from_hub in plain values
     arguments = yaml.load((settings / ARGUMENTS).read_text(encoding="utf-8"), yaml.UnsafeLoader)
     env_kwargs = arguments["env_kwargs"] or {}
     check_settings(config, args.algo, settings / CONFIG)

@@ -36,7 +36,7 @@ def model_card(agent: Agent, model: BaseAlgorithm, figures: Figures, seeds: rang
 
 # {name} in {env_id}
 
-A safe driver by {name} of `sb3_esad`, on Stable-Baselines3 and RL Zoo. {_limit(model, figures)}
+{name} of `sb3_esad` on Stable-Baselines3, trained by RL Zoo. {_limit(model, figures)}
 
 ## Evaluation
 

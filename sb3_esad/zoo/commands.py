@@ -5,7 +5,7 @@ import runpy
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -54,10 +54,8 @@ def _run_script(module: str) -> None:
 def _plot(function: str) -> None:
     from matplotlib import pyplot
 
-    if pyplot.get_backend().lower() == "agg":  # what is chosen where there is no screen
-        with mock.patch.object(pyplot, "show", _save_figures):
-            _call("rl_zoo3.plots", function)
-    else:
+    screen = pyplot.get_backend().lower() != "agg"  # which is chosen where there is none
+    with nullcontext() if screen else mock.patch.object(pyplot, "show", _save_figures):
         _call("rl_zoo3.plots", function)
 
 

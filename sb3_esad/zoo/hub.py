@@ -13,10 +13,11 @@ import httpx2
 from huggingface_hub import HfApi
 from huggingface_sb3 import EnvironmentName, ModelName, ModelRepoId
 from rl_zoo3.utils import create_test_env, get_latest_run_id
-from stable_baselines3.common.base_class import BaseAlgorithm
+from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.vec_env import VecEnv
 
 from sb3_esad.algorithms import ALGORITHMS
+from sb3_esad.common.checks import require
 from sb3_esad.demo import UNSEEN
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.panels import Picture
@@ -42,20 +43,16 @@ def push_to_hub() -> None:
     parser.add_argument("-n", "--n-timesteps", type=int, default=1000, help="of the video at most (default: %(default)s)")
     parser.add_argument("--no-render", action="store_true", help="no video")
     args = parser.parse_args()
+    for name in ("episodes", "n_timesteps"):
+        require(getattr(args, name) >= 1, name, getattr(args, name), "a number >= 1")
     agent, repository = find_agent(args), _repository(args)
     model = ALGORITHMS[agent.algo].load(agent.model)
-    seeds = range(UNSEEN, UNSEEN + args.episodes)
-    print(f"Evaluating on {args.episodes} episodes ...", flush=True)
-    records = evaluate_model(model, agent.env.gym_id, seeds, env_kwargs=agent.env_kwargs)
     with TemporaryDirectory() as name:
         folder = Path(name)
         pack(folder, agent)
-        figures = summarise_any(records)
-        write_json(folder / "results.json", {"mean_reward": figures["return"], "figures": figures, "records": records})
         if not args.no_render:
             film(folder / "replay.mp4", model, agent, args.n_timesteps)
-        card = model_card(agent, model, figures, seeds, repository)
-        (folder / "README.md").write_text(card, encoding="utf-8")
+        describe(folder, model, agent, args.episodes, repository)
         with _errors_on_one_line(repository):
             url = HfApi().create_repo(repository, exist_ok=True)
             HfApi().upload_folder(repo_id=repository, folder_path=folder, commit_message=args.commit_message)
@@ -109,11 +106,30 @@ def _repository(args: argparse.Namespace) -> str:
 def _errors_on_one_line(repository: str) -> Iterator[None]:
     try:
         yield
-    except httpx2.HTTPError as error:
+    except (httpx2.HTTPError, OSError, RuntimeError) as error:
         raise OSError(f"{repository}: {' '.join(str(error).split())}") from error
 
 
-def film(path: Path, model: BaseAlgorithm, agent: Agent, n_steps: int) -> None:
+def describe(folder: Path, model: OffPolicyAlgorithm, agent: Agent, n_episodes: int, repository: str) -> None:
+    """
+    Evaluate an agent on episodes that no training has seen, and write what came of it.
+
+    :param folder: where to write ``results.json`` and the card, ``README.md``
+    :param model: that drives
+    :param agent: whose environment it is
+    :param n_episodes: how many
+    :param repository: where it is shared
+    """
+    print(f"Evaluating on {n_episodes} episodes ...", flush=True)
+    seeds = range(UNSEEN, UNSEEN + n_episodes)
+    records = evaluate_model(model, agent.env.gym_id, seeds, env_kwargs=agent.env_kwargs)
+    figures = summarise_any(records)
+    write_json(folder / "results.json", {"mean_reward": figures["return"], "figures": figures, "records": records})
+    card = model_card(agent, model, figures, seeds, repository)
+    (folder / "README.md").write_text(card, encoding="utf-8")
+
+
+def film(path: Path, model: OffPolicyAlgorithm, agent: Agent, n_steps: int) -> None:
     """
     Film the first episode of the evaluation.
 
@@ -128,7 +144,7 @@ def film(path: Path, model: BaseAlgorithm, agent: Agent, n_steps: int) -> None:
         write_video(path, _pictures(model, env, n_steps), env.get_attr("metadata")[0].get("render_fps", 30))
 
 
-def _pictures(model: BaseAlgorithm, env: VecEnv, n_steps: int) -> Iterator[Picture]:
+def _pictures(model: OffPolicyAlgorithm, env: VecEnv, n_steps: int) -> Iterator[Picture]:
     observation, state = cast(Any, env.reset()), None
     for _ in range(n_steps):
         yield cast(Picture, env.render())
