@@ -30,7 +30,7 @@ LAYERS = [
     "common.recurrent_algorithm common.latent_algorithm common.constrained_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",
     "",  # the package itself, which re-exports
-    "driving_evaluation report dream explanation panels progress hyperparams",
+    "driving_evaluation report dream explanation panels progress hyperparams algorithms",
     "moments plots",
     "video",
     "demo zoo benchmark",

@@ -17,6 +17,7 @@ from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
+from sb3_esad.common.cost_buffers import CostReplayBuffer
 from sb3_esad.common.plain_values import from_plain, to_plain
 
 DESCRIPTION = "sb3_esad.json"
@@ -95,7 +96,7 @@ def named_classes(algorithm: type[OffPolicyAlgorithm]) -> dict[str, type]:
     :param algorithm: that is described
     :return: its policies by their aliases, and replay buffers
     """
-    buffers = (SequenceReplayBuffer, ReplayBuffer, DictReplayBuffer)
+    buffers = (SequenceReplayBuffer, CostReplayBuffer, ReplayBuffer, DictReplayBuffer)
     return {**algorithm.policy_aliases, **{each.__name__: each for each in buffers}}
 
 
