@@ -1,15 +1,17 @@
 """Bird's-eye view of the traffic around the ego vehicle, drawn with OpenCV to a fraction of a pixel."""
 
+import math
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.geometry import Floats, box_corners
+from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lights import StopLines
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.roads import Bools, Markings
+from sb3_esad.envs.roads import Bools, Ints, Markings
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 
@@ -24,6 +26,87 @@ AMBER_GREY = 210  # of the line before an amber light
 DIAL_SPEED, DIAL_GREY = 32.0, 160  # the speed at which the dial is as high as the image [m/s]
 DIAL_SHARE = 1 / 16  # of the image's width, at either edge
 OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
+OUTLINE = 2  # nothing further outside than this leaves a trace in an image [px]
+
+
+class Shapes(NamedTuple):
+    """
+    Shapes that lie still, and the circles around them.
+
+    :param points: shape ``(n, k, 2)`` [m]
+    :param greys: shape ``(n,)``
+    :param centres: shape ``(n, 2)`` [m]
+    :param radii: shape ``(n,)`` [m]
+    """
+
+    points: Floats
+    greys: Ints
+    centres: Floats
+    radii: Floats
+
+    @classmethod
+    def of(cls, points: Floats, greys: Ints) -> "Shapes":
+        """
+        Circle shapes.
+
+        :param points: shape ``(n, k, 2)`` [m]
+        :param greys: shape ``(n,)``
+        :return: the shapes
+        """
+        centres = points.mean(1)
+        offset = points - centres[:, None]
+        return cls(points, greys, centres, np.hypot(offset[..., 0], offset[..., 1]).max(1, initial=0.0))
+
+
+class Ground:
+    """
+    What does not move, as it is drawn: asphalt, brighter where the route leads, and painted lines.
+
+    :param markings: of the road
+    :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
+    """
+
+    def __init__(self, markings: Markings, route: Bools) -> None:
+        surfaces, on_route = markings.with_route_on_top(route)
+        self.asphalt = Shapes.of(surfaces, np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY))
+        self.paint = Shapes.of(markings.lines, np.where(markings.dashed, DASH_GREY, LINE_GREY))
+
+
+class Frame:
+    """
+    What a :class:`View` sees from one place.
+
+    :param view: size and scale of the image
+    :param origin: the point of view, shape ``(2,)`` [m]
+    :param heading: the direction that points up [rad]
+    """
+
+    def __init__(self, view: "View", origin: Floats, heading: float) -> None:
+        cos, sin = math.cos(heading), math.sin(heading)
+        self._turn = np.array([[-sin, cos], [cos, sin]]) * view.scale
+        self._shift = view.centre - origin @ self._turn
+        self._middle = float(origin[0]) + view.reach * cos, float(origin[1]) + view.reach * sin
+        self._radius = view.radius
+
+    def near(self, centres: Floats, radii: Floats) -> Ints:
+        """
+        Sort out most of what is out of sight.
+
+        :param centres: of circles, shape ``(n, 2)`` [m]
+        :param radii: of these, shape ``(n,)`` [m]
+        :return: indices of all that may have a part in the image
+        """
+        x, y = self._middle
+        return (np.hypot(centres[:, 0] - x, centres[:, 1] - y) <= radii + self._radius).nonzero()[0]
+
+    def pixels(self, points: Floats) -> NDArray[np.int32]:
+        """
+        Pixel coordinates of points of the world.
+
+        :param points: shape ``(..., 2)`` [m]
+        :return: column and row in fixed point, shape ``(..., 2)`` [px / 16]
+        """
+        return np.rint(points.reshape(-1, 2) @ self._turn + self._shift).astype(np.int32).reshape(points.shape)
 
 
 class View:
@@ -36,24 +119,15 @@ class View:
     """
 
     def __init__(self, shape: Sequence[int], metres_per_pixel: Sequence[float], ahead: float) -> None:
-        self.shape = (int(shape[0]), int(shape[1]))
-        self._scale = np.array([1 / metres_per_pixel[1], -1 / metres_per_pixel[0]]) * 2**SUBPIXEL_BITS
-        centre = np.array([self.shape[1] / 2, self.shape[0] * ahead]) - 0.5  # OpenCV counts from the first pixel's centre
-        self._centre = centre * 2**SUBPIXEL_BITS
-        self._limit = np.array([self.shape[1], self.shape[0]]) * 2**SUBPIXEL_BITS
-
-    def pixels(self, points: Floats, origin: Floats, heading: float) -> NDArray[np.int32]:
-        """
-        Pixel coordinates of points of the world.
-
-        :param points: shape ``(..., 2)`` [m]
-        :param origin: the point of view, shape ``(2,)`` [m]
-        :param heading: the direction that points up [rad]
-        :return: column and row in fixed point, shape ``(..., 2)`` [px / 16]
-        """
-        cos, sin = np.cos(heading), np.sin(heading)
-        turn = np.array([[-sin, cos], [cos, sin]]).T
-        return np.rint((points - origin) @ turn * self._scale + self._centre).astype(np.int32)
+        rows, columns = self.shape = (int(shape[0]), int(shape[1]))
+        along, across = metres_per_pixel
+        self.scale = np.array([1 / across, -1 / along]) * 2**SUBPIXEL_BITS
+        self.centre = (np.array([columns / 2, rows * ahead]) - 0.5) * 2**SUBPIXEL_BITS  # OpenCV counts from a pixel's centre
+        self.reach = (ahead - 0.5) * rows * along
+        """How far the middle of the image is ahead of the origin [m]."""
+        self.radius = math.hypot((rows / 2 + OUTLINE) * along, (columns / 2 + OUTLINE) * across)
+        """Of the circle around the image [m]."""
+        self._limit = np.array([columns, rows]) * 2**SUBPIXEL_BITS
 
     def visible(self, shapes: NDArray[np.int32]) -> list[int]:
         """
@@ -62,10 +136,8 @@ class View:
         :param shapes: pixel coordinates of n shapes of k points, shape ``(n, k, 2)`` [px / 16]
         :return: their indices
         """
-        low, high = shapes.min(1), shapes.max(1)
-        columns, rows = self._limit
-        seen = (high[:, 0] >= 0) & (high[:, 1] >= 0) & (low[:, 0] <= columns) & (low[:, 1] <= rows)
-        return np.flatnonzero(seen).tolist()
+        seen = (shapes >= 0).any(1) & (shapes <= self._limit).any(1)
+        return seen.all(1).nonzero()[0].tolist()
 
     def fill(self, images: Sequence[Image], shapes: NDArray[np.int32], colours: Sequence[Colour]) -> None:
         """
@@ -104,17 +176,17 @@ def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
     return np.rint(shapes + steps - steps[:, [3, 0, 1, 2]]).astype(np.int32)
 
 
-def user_greys(traffic: Traffic) -> list[int]:
+def user_greys(traffic: Traffic) -> Ints:
     """
     Grey levels that tell the speed of vehicles, the ego vehicle's span being the smaller; 255 for what must not be hit.
 
     :param traffic: all road users
-    :return: one grey level per user; never 0, which means that nobody is there
+    :return: one grey level per user, never 0, which means that nobody is there, shape ``(n,)``
     """
     share = np.minimum(traffic.speed / TOP_SPEED, 1.0)
-    grey = np.where(traffic.kind == Kind.VEHICLE, STANDING_GREY + USER_SPAN * share, OBSTACLE_GREY)
+    grey = np.where(traffic.is_vehicle, STANDING_GREY + USER_SPAN * share, OBSTACLE_GREY)
     grey[EGO] = STANDING_GREY + EGO_SPAN * share[EGO]
-    return np.rint(grey).astype(int).tolist()
+    return np.rint(grey).astype(np.int64)
 
 
 def draw_dial(image: Image, speed: float) -> None:
@@ -128,7 +200,7 @@ def draw_dial(image: Image, speed: float) -> None:
     :param speed: [m/s]
     """
     height = min(speed / DIAL_SPEED, 1.0) * image.shape[0]
-    filled = np.clip(height - np.arange(image.shape[0])[::-1], 0.0, 1.0)
+    filled = np.minimum(np.maximum(height - np.arange(image.shape[0])[::-1], 0.0), 1.0)
     width = max(1, round(DIAL_SHARE * image.shape[1]))
     image[:, :width] = image[:, -width:] = np.rint(DIAL_GREY * filled).astype(np.uint8)[:, None]
 
@@ -147,33 +219,29 @@ class BirdsEyeView:
     def __init__(self, view: View) -> None:
         self.view = view
 
-    def draw(self, markings: Markings, route: Bools, traffic: Traffic, stop_lines: StopLines, heading: float) -> Image:
+    def draw(self, ground: Ground, traffic: Traffic, stop_lines: StopLines, heading: float) -> Image:
         """
         Draw the surroundings of the ego vehicle.
 
-        :param markings: of the road
-        :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
+        :param ground: the road
         :param traffic: all road users
         :param stop_lines: before lights that are not green
         :param heading: the direction that points up [rad]
         :return: the image, shape ``(3, rows, columns)``
         """
-        view, origin = self.view, traffic.position[EGO]
+        view, frame = self.view, Frame(self.view, traffic.position[EGO], heading)
         image = np.zeros((3, *view.shape), dtype=np.uint8)
         road, users, obstacles = image
-        corners = box_corners(traffic.position, traffic.heading, traffic.size)
-        moves = traffic.kind == Kind.VEHICLE
-        moves[EGO] = False
-        surfaces, on_route = markings.with_route_on_top(route)
-        asphalt = view.pixels(surfaces, origin, heading)
-        boxes = inset(view.pixels(np.concatenate([stop_lines.corners, corners]), origin, heading))
-        layers = (
-            [road] * len(asphalt) + [obstacles] * len(stop_lines.red) + [users if moving else obstacles for moving in moves]
-        )
-        greys = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist()
-        greys += np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY).tolist() + user_greys(traffic)
-        view.fill(layers, np.concatenate([asphalt, boxes]), greys)
-        paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
-        view.lines(road, view.pixels(markings.lines, origin, heading), paint)
+        asphalt = frame.near(ground.asphalt.centres, ground.asphalt.radii)
+        rows = frame.near(traffic.position, traffic.radius)
+        moves = traffic.is_vehicle[rows] & (rows != EGO)
+        boxes = np.concatenate([stop_lines.corners, traffic.corners[rows]])
+        layers = [road] * len(asphalt) + [obstacles] * len(stop_lines.red)
+        layers += [users if moving else obstacles for moving in moves.tolist()]
+        shapes = np.concatenate([frame.pixels(ground.asphalt.points[asphalt]), inset(frame.pixels(boxes))])
+        light = np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY)
+        view.fill(layers, shapes, np.concatenate([ground.asphalt.greys[asphalt], light, user_greys(traffic)[rows]]).tolist())
+        paint = frame.near(ground.paint.centres, ground.paint.radii)
+        view.lines(road, frame.pixels(ground.paint.points[paint]), ground.paint.greys[paint].tolist())
         draw_dial(obstacles, float(traffic.speed[EGO]))
         return image

@@ -1,10 +1,11 @@
 """All road users as arrays: their bodies, how they move, and where they are on the lanes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats
+from sb3_esad.envs.geometry import Floats, box_corners, directions
 from sb3_esad.envs.lanes import CAR_LENGTH, LANE_WIDTH, NO_LANE
 from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Kind, User
@@ -17,6 +18,20 @@ OFF_PATH = 1.5  # where lanes overlap, one is on that of one's path even if anot
 LOOKAHEAD = 3  # lanes that are looked into beyond the present one
 
 
+class LanesAhead(NamedTuple):
+    """
+    Lanes that some users will take after given ones, those of each user in order, the furthest first.
+
+    :param order: the place of the user among them, shape ``(n,)``
+    :param lane: shape ``(n,)``
+    :param start: how far it starts from the start of the lane from which the user comes, shape ``(n,)`` [m]
+    """
+
+    order: Ints
+    lane: Ints
+    start: Floats
+
+
 class RoadUsers:
     """
     Road users on a road, row ``EGO`` being the ego vehicle; positions are projected onto the lanes once per move.
@@ -27,21 +42,25 @@ class RoadUsers:
 
     def __init__(self, road: Road, users: Sequence[User]) -> None:
         self.road = road
-        self.position = np.array([user.position for user in users], dtype=np.float64)
+        # Two columns, each of them contiguous: numpy is slow on pairs.
+        self.position = np.array([user.position for user in users], dtype=np.float64, order="F")
         self.heading = np.array([user.heading for user in users], dtype=np.float64)
         self.speed = np.array([user.speed for user in users], dtype=np.float64)
-        self.size = np.array([user.size for user in users], dtype=np.float64)
+        self.size = np.array([user.size for user in users], dtype=np.float64, order="F")
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
         self.kind = np.array([user.kind for user in users], dtype=np.int64)
-        self._margin = np.where(self.kind == Kind.STATIC, self.size[:, 1] / 2, LANE_MARGIN)
-        self._any_on_foot = bool((self.kind == Kind.PERSON).any())
+        self.is_vehicle = self.kind == Kind.VEHICLE
         self.drivers = np.flatnonzero([user.drives for user in users])
         self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
         self.acceleration = np.zeros(len(users))
         self.wheel_angle = np.zeros(len(users))
-        self.next_lane, self.towards_path, self.leads_astray, off_path = self._follow_paths(users)
-        self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T
         self._rows = np.arange(len(users))
+        margin = np.where(self.kind == Kind.STATIC, self.size[:, 1] / 2, LANE_MARGIN)
+        self._berth = road.width[:, None] / 2 + margin
+        self._any_on_foot = bool((self.kind == Kind.PERSON).any())
+        self.next_lane, self.towards_path, self.leads_astray, off_path = self._follow_paths(users)
+        self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T.copy()
+        self._following_lanes, self._starts = self._foresee_lanes()
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
         self.target_lane[:] = self.lane
@@ -69,60 +88,83 @@ class RoadUsers:
                 off_path[row, list(road.with_lanes_beside(user.path))] = 0.0
         return following, towards, astray, off_path
 
+    def _foresee_lanes(self) -> tuple[Ints, Floats]:
+        """
+        Go on from every lane, as each user would; the furthest comes first in each array.
+
+        :return: the lanes, ``NO_LANE`` after the last one, and how far their starts are from the start of the first [m]; each
+            of shape ``(users, lanes, LOOKAHEAD)``
+        """
+        lanes, passed = np.broadcast_to(np.arange(len(self.road.length)), self.next_lane.shape), np.zeros(self.next_lane.shape)
+        ahead, starts = [], []
+        for _ in range(LOOKAHEAD):
+            passed = passed + self.road.length[lanes]
+            lanes = np.where(lanes == NO_LANE, NO_LANE, self.next_lane[self._rows[:, None], lanes])
+            ahead.append(lanes)
+            starts.append(passed)
+        return np.stack(ahead[::-1], axis=-1), np.stack(starts[::-1], axis=-1)
+
     def _locate(self) -> None:
         road, count = self.road, len(self.speed)
-        self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], -1)
+        self.direction = directions(self.heading)
         self.velocity = self.speed[:, None] * self.direction
+        self.corners = box_corners(self.position, self.heading, self.size)
         soon = self.position[self.outsiders] + INTENTION_HORIZON * self.velocity[self.outsiders]
-        along, across = road.project(np.concatenate([self.position, soon]))
-        heading = np.concatenate([self.heading, self.heading[self.outsiders]])
-        lane = road.closest_lane(along, across, heading, self._handicap)
+        along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))
+        aside, overshoot = np.abs(across), road.overshoot(along)
         self.along, self.across = along[:, :count], across[:, :count]
+        self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)
+        self.off_road = not all(road.covers(aside[:, -4:], overshoot[:, -4:]))
+        heading = np.concatenate([self.heading, self.heading[self.outsiders]])
+        lane = road.closest_lane(along[:, :-4], (aside + overshoot)[:, :-4], heading, self._handicap)
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
-        within = np.abs(self.across) <= road.width[:, None] / 2 + self._margin
-        self.present = within & (road.overshoot(self.along) <= CAR_LENGTH)
-        # Others make room for a user that they do not steer in the lane where it will soon be, too.
+        self._note_intentions(aside[:, count:])
+        self.ahead = self.lanes_ahead(self._rows, self.lane)
+        self.gap, there = self._look(self._rows, self.lane, self.ahead)
+        self.front = nearest_ahead(self.gap, there)
+
+    def _note_intentions(self, soon_aside: Floats) -> None:
+        """Others make room for a user that they do not steer in the lane where it will soon be, too."""
         rows = self.outsiders
         if self._any_on_foot:  # people beside the road are in nobody's way
-            soon_off = np.abs(across[lane[count:], np.arange(count, len(lane))])
+            soon_off = soon_aside[self.target_lane[rows], np.arange(len(rows))]
             rows = rows[(self.kind[rows] != Kind.PERSON) | (soon_off <= LANE_WIDTH / 2)]
         self.present[self.target_lane[rows], rows] = True
-        self.reach, there = self.look_ahead(self._rows, self.lane)
-        self.front, self.rear = self._nearest(self._rows, self.reach, there)
 
-    def look_ahead(self, rows: Ints, lanes: Ints) -> tuple[Floats, Bools]:
+    def gaps(self, rows: Ints, lanes: Ints) -> tuple[Floats, Bools]:
         """
         Place everybody along given lanes and those that some users take after them.
 
         :param rows: users, shape ``(n,)``
         :param lanes: the lane to look at for each of them, shape ``(n,)``
-        :return: distance of every user from the start of the lane, by its projection onto it if it is on none of them [m]; and
-            whether it is on one of them; each ``(n, users)``
+        :return: how far everybody is ahead of each of them, by the projection onto the lane of who is on none of these [m]; and
+            whether it is somebody else who is on one of them; each ``(n, users)``
         """
-        place, there = self.along[lanes], self.present[lanes]
-        for going, following, passed in self.lanes_ahead(rows, lanes):
-            beyond = self.present[following] & ~there[going]
-            place[going] = np.where(beyond, passed[:, None] + self.along[following], place[going])
-            there[going] |= beyond
-        return place, there
+        return self._look(rows, lanes, self.lanes_ahead(rows, lanes))
 
-    def lanes_ahead(self, rows: Ints, lanes: Ints) -> Iterator[tuple[Ints, Ints, Floats]]:
+    def _look(self, rows: Ints, lanes: Ints, ahead: LanesAhead) -> tuple[Floats, Bools]:
+        place, there = self.along[lanes], self.present[lanes]
+        if ahead.order.size:
+            seen, others = self.present[ahead.lane].nonzero()
+            beyond = ~there[ahead.order[seen], others]
+            seen, others = seen[beyond], others[beyond]
+            order, distance = ahead.order[seen], ahead.start[seen] + self.along[ahead.lane[seen], others]
+            place[order, others], there[order, others] = distance, True  # the nearest lane comes last and wins
+        order = np.arange(len(rows))
+        there[order, rows] = False
+        return place - place[order, rows][:, None], there
+
+    def lanes_ahead(self, rows: Ints, lanes: Ints) -> LanesAhead:
         """
         Go on from lane to lane, as users take them.
 
         :param rows: users, shape ``(n,)``
         :param lanes: the lane from which each goes on, shape ``(n,)``
-        :return: for the first lanes ahead, then for the second and so on: the places in ``rows`` of those who have one, that
-            lane of each, and how far its start is from the start of the lane from which they came [m]
+        :return: the lanes ahead of all of them
         """
-        going, passed = np.arange(len(rows)), np.zeros(len(rows))
-        for _ in range(LOOKAHEAD):
-            passed, lanes = passed + self.road.length[lanes], self.next_lane[rows[going], lanes]
-            on = lanes != NO_LANE
-            if not on.any():
-                return
-            going, lanes, passed = going[on], lanes[on], passed[on]
-            yield going, lanes, passed
+        following = self._following_lanes[rows, lanes]
+        order, step = (following != NO_LANE).nonzero()
+        return LanesAhead(order, following[order, step], self._starts[rows[order], lanes[order], step])
 
     def neighbours(self, rows: Ints, lanes: Ints) -> tuple[Ints, Ints]:
         """
@@ -132,17 +174,8 @@ class RoadUsers:
         :param lanes: the lane to look at for each of them, shape ``(n,)``
         :return: rows of those ahead and of those behind, each ``(n,)``, -1 where there is nobody
         """
-        return self._nearest(rows, *self.look_ahead(rows, lanes))
-
-    @staticmethod
-    def _nearest(rows: Ints, place: Floats, there: Bools) -> tuple[Ints, Ints]:
-        order = np.arange(len(rows))
-        gap = place - place[order, rows][:, None]
-        gap[~there] = np.nan
-        gap[order, rows] = np.nan
-        ahead, behind = np.where(gap >= 0, gap, np.inf), np.where(gap < 0, gap, -np.inf)
-        front, rear = ahead.argmin(1), behind.argmax(1)
-        return np.where(ahead[order, front] < np.inf, front, -1), np.where(behind[order, rear] > -np.inf, rear, -1)
+        gap, there = self.gaps(rows, lanes)
+        return nearest_ahead(gap, there), nearest_behind(gap, there)
 
     def distance(self, rows: Ints, others: Ints) -> Floats:
         """
@@ -152,7 +185,7 @@ class RoadUsers:
         :param others: shape ``(n,)``
         :return: negative behind, shape ``(n,)`` [m]
         """
-        return self.reach[rows, others] - self.reach[rows, rows]
+        return self.gap[rows, others]
 
     def move(self, dt: float) -> None:
         """
@@ -162,10 +195,37 @@ class RoadUsers:
         """
         slip = np.arctan(0.5 * np.tan(self.wheel_angle))
         course = self.heading + slip
-        self.position[:, 0] += self.speed * np.cos(course) * dt
-        self.position[:, 1] += self.speed * np.sin(course) * dt
+        self.position += self.speed[:, None] * directions(course) * dt
         self.heading += self.speed * np.sin(slip) / (self.size[:, 0] / 2) * dt
         slowing = np.minimum(self.acceleration, TOP_SPEED - self.speed)
         acceleration = np.where(self.speed > TOP_SPEED, slowing, self.acceleration)
         self.speed = np.maximum(self.speed + acceleration * dt, 0.0)
         self._locate()
+
+
+def nearest_ahead(gap: Floats, there: Bools) -> Ints:
+    """
+    Find who is next.
+
+    :param gap: how far each user is ahead of each of n others, shape ``(n, users)`` [m]
+    :param there: whether it counts, shape ``(n, users)``
+    :return: its row, -1 where there is nobody, shape ``(n,)``
+    """
+    ahead = np.where(there & (gap >= 0), gap, np.inf)
+    nearest = ahead.argmin(1)
+    nearest[ahead.min(1) == np.inf] = -1
+    return nearest
+
+
+def nearest_behind(gap: Floats, there: Bools) -> Ints:
+    """
+    Find who follows.
+
+    :param gap: how far each user is ahead of each of n others, shape ``(n, users)`` [m]
+    :param there: whether it counts, shape ``(n, users)``
+    :return: its row, -1 where there is nobody, shape ``(n,)``
+    """
+    behind = np.where(there & (gap < 0), gap, -np.inf)
+    nearest = behind.argmax(1)
+    nearest[behind.max(1) == -np.inf] = -1
+    return nearest

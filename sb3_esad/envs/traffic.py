@@ -5,9 +5,9 @@ from dataclasses import fields
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats, wrap_angle
+from sb3_esad.envs.geometry import Floats, bounded, wrap_angle
 from sb3_esad.envs.lanes import CAR_LENGTH, NO_LANE
-from sb3_esad.envs.road_users import RoadUsers
+from sb3_esad.envs.road_users import RoadUsers, nearest_ahead
 from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Temper, User
 
@@ -24,11 +24,6 @@ PURSUIT = 0.1  # cars take the direction that their lane will have after this ti
 def not_zero(value: Floats) -> Floats:
     """Keep values at least 0.01 away from zero, so that one can divide by them."""
     return np.copysign(np.maximum(np.abs(value), 0.01), value)
-
-
-def bounded(value: Floats, limit: float) -> Floats:
-    """Keep values within plus and minus a limit; several times faster than ``np.clip`` on short arrays."""
-    return np.minimum(np.maximum(value, -limit), limit)
 
 
 class Traffic(RoadUsers):
@@ -49,9 +44,10 @@ class Traffic(RoadUsers):
         self.temper = {f.name: np.array([getattr(user.temper, f.name) for user in users]) for f in fields(Temper)}
         own = self.temper
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
-        self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking])
+        self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking], axis=-1)
         self.forced_braking = np.zeros(len(users))  # a scenario makes a car brake this hard, whatever it would do [m/s^2]
         self.stop_distance = np.full(len(users), np.inf)  # to a line before which a car must wait, from its centre [m]
+        self._first_change = np.where(road.continues, BLIND_BEHIND, 0.0)  # from here on one may change to each lane [m]
         super().__init__(road, users)
 
     def _locate(self) -> None:
@@ -60,11 +56,12 @@ class Traffic(RoadUsers):
 
     def _foresee_limits(self) -> Floats:
         """The speed from which each user can still slow down in time for the lanes ahead, shape ``(n,)``."""
-        limits, own = self.road.speed_limit, self.along[self.lane, self._rows]
+        limits = self.road.speed_limit
         limit = limits[self.lane]
-        for going, lanes, passed in self.lanes_ahead(self._rows, self.lane):
-            distance = np.maximum(passed - own[going], 0.0)
-            limit[going] = np.minimum(limit[going], np.sqrt(limits[lanes] ** 2 + 2 * EASY_BRAKING * distance))
+        rows, lanes, start = self.ahead
+        if rows.size:
+            distance = np.maximum(start - self.along[self.lane[rows], rows], 0.0)
+            np.minimum.at(limit, rows, np.sqrt(limits[lanes] ** 2 + 2 * EASY_BRAKING * distance))
         return limit
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
@@ -76,11 +73,12 @@ class Traffic(RoadUsers):
         :param judges: the users whose temper is applied, shape ``(n,)``
         :return: accelerations, shape ``(n,)`` [m/s^2]
         """
-        acceleration, exponent, gap, headway, braking = self._following[:, judges]
+        acceleration, exponent, gap, headway, braking = self._following[judges].T
         speed = self.speed[rows]
         desired = not_zero(np.minimum(self.target_speed[rows], self.speed_limit[rows]))
         distance = not_zero(self.distance(rows, front))
-        closing = np.einsum("nd,nd->n", self.velocity[rows] - self.velocity[front], self.direction[rows])
+        (east, south), (cos, sin) = self.velocity.T, self.direction.T
+        closing = (east[rows] - east[front]) * cos[rows] + (south[rows] - south[front]) * sin[rows]
         wanted = gap + speed * headway + speed * closing / braking
         crowding = (front >= 0) * (wanted / distance) ** 2
         return (rows >= 0) * acceleration * (1.0 - (speed / desired) ** exponent - crowding)
@@ -93,7 +91,7 @@ class Traffic(RoadUsers):
         :return: infinite for who need not wait, shape ``(n,)`` [m/s^2]
         """
         distance, speed = self.stop_distance[rows], self.speed[rows]
-        acceleration, _, _, _, braking = self._following[:, rows]
+        acceleration, _, _, _, braking = self._following[rows].T
         wanted = STOP_GAP + STOP_HEADWAY * speed + speed**2 / braking
         free = acceleration * (1.0 - (speed / not_zero(self.target_speed[rows])) ** 4)
         stopping = free - acceleration * (wanted / np.maximum(distance, 0.1)) ** 2
@@ -120,11 +118,11 @@ class Traffic(RoadUsers):
         :param lanes: the lane each considers, shape ``(n,)``
         :return: one verdict per user, shape ``(n,)``
         """
-        new_front, new_rear = self.neighbours(rows, lanes)
-        old_front, old_rear = self.front[rows], self.rear[rows]
+        both = self.neighbours(np.concatenate([rows, rows]), np.concatenate([lanes, self.lane[rows]]))
+        (new_front, old_front), (new_rear, old_rear) = (each.reshape(2, -1) for each in both)
         who = np.concatenate([new_rear, new_rear, rows, rows, old_rear, old_rear])
         front = np.concatenate([new_front, rows, new_front, old_front, rows, old_front])
-        outcomes = self.following_acceleration(who, front, np.tile(rows, 6)).reshape(6, -1)
+        outcomes = self.following_acceleration(who, front, np.concatenate([rows] * 6)).reshape(6, -1)
         rear_now, rear_then, own_then, own_now, left_now, left_then = outcomes
         others = rear_then - rear_now + left_then - left_now
         advantage = own_then - own_now + self.temper["politeness"][rows] * others
@@ -157,23 +155,30 @@ class Traffic(RoadUsers):
         self._choose_lanes(rows)
         target = self.target_lane[rows]
         self.wheel_angle[rows] = self.steering(rows, target)
-        acceleration = self.following_acceleration(rows, self.front[rows], rows)
-        changing = np.flatnonzero(target != self.lane[rows])
-        if changing.size:
-            cars = rows[changing]
-            front, _ = self.neighbours(cars, target[changing])
-            acceleration[changing] = np.minimum(acceleration[changing], self.following_acceleration(cars, front, cars))
-        waiting = np.flatnonzero(self.stop_distance[rows] < np.inf)
+        acceleration = self._follow(rows, target)
+        waiting = (self.stop_distance[rows] < np.inf).nonzero()[0]
         if waiting.size:
             acceleration[waiting] = np.minimum(acceleration[waiting], self.stopping_acceleration(rows[waiting]))
         forced = self.forced_braking[rows]
         self.acceleration[rows] = np.where(forced > 0.0, -forced, bounded(acceleration, MAX_ACCELERATION))
 
+    def _follow(self, rows: Ints, target: Ints) -> Floats:
+        """Accelerations behind who is ahead in the own lane and, if that is another one, in the target lane, too."""
+        changing = (target != self.lane[rows]).nonzero()[0]
+        if not changing.size:
+            return self.following_acceleration(rows, self.front[rows], rows)
+        cars = rows[changing]
+        front = nearest_ahead(*self.gaps(cars, target[changing]))
+        everyone = np.concatenate([rows, cars])
+        acceleration = self.following_acceleration(everyone, np.concatenate([self.front[rows], front]), everyone)
+        acceleration[changing] = np.minimum(acceleration[changing], acceleration[len(rows) :])
+        return acceleration[: len(rows)]
+
     def _continue_lanes(self, rows: Ints) -> None:
         target = self.target_lane[rows]
-        done = self.along[target, rows] > self.road.length[target] - CAR_LENGTH / 2
         following = self.next_lane[rows, target]
-        self.target_lane[rows] = np.where(done & (following != NO_LANE), following, target)
+        done = (following != NO_LANE) & (self.along[target, rows] > self.road.length[target] - CAR_LENGTH / 2)
+        self.target_lane[rows[done]] = following[done]
 
     def _choose_lanes(self, rows: Ints) -> None:
         before = self.target_lane.copy()
@@ -183,9 +188,10 @@ class Traffic(RoadUsers):
             self.timer[pondering] = 0.0
             due = self.must_get_back(pondering, self.lane[pondering])
             self._ponder(pondering[~due])
-            self._get_back(pondering[due])
-        for row in rows[changing]:
-            self._reconsider(int(row), before)
+            if due.any():
+                self._get_back(pondering[due])
+        for row in rows[changing].tolist():
+            self._reconsider(row, before)
 
     def must_get_back(self, rows: Ints, lanes: Ints) -> Bools:
         """
@@ -203,22 +209,23 @@ class Traffic(RoadUsers):
         lanes = np.concatenate([self.road.left[self.lane[rows]], self.road.right[self.lane[rows]]])
         possible = (lanes != NO_LANE) & self._can_change(cars, lanes) & ~self.must_get_back(cars, lanes)
         cars, lanes = cars[possible], lanes[possible]
-        worth = self.change_is_worth_it(cars, lanes)
-        self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
+        if cars.size:
+            worth = self.change_is_worth_it(cars, lanes)
+            self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
 
     def _get_back(self, rows: Ints) -> None:
         lanes = self.towards_path[rows, self.lane[rows]]
         possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
         rows, lanes = rows[possible], lanes[possible]
-        safe = self.change_is_safe(rows, lanes)
-        self.target_lane[rows[safe]] = lanes[safe]
+        if rows.size:
+            safe = self.change_is_safe(rows, lanes)
+            self.target_lane[rows[safe]] = lanes[safe]
 
     def _can_change(self, rows: Ints, lanes: Ints) -> Bools:
-        along, across = self.along[lanes, rows], self.across[lanes, rows]
-        reachable = (np.abs(across) <= 2 * self.road.width[lanes]) & (along >= 0)
-        reachable &= along < self.road.length[lanes] + CAR_LENGTH
-        reachable &= (along >= BLIND_BEHIND) | ~self.road.continues[lanes]
-        return np.asarray(reachable & (np.abs(self.speed[rows]) >= 1.0))
+        along = self.along[lanes, rows]
+        reachable = (along >= self._first_change[lanes]) & (along < self.road.length[lanes] + CAR_LENGTH)
+        reachable &= np.abs(self.across[lanes, rows]) <= 2 * self.road.width[lanes]
+        return np.asarray(reachable & (self.speed[rows] >= 1.0))
 
     def _reconsider(self, row: int, before: Ints) -> None:
         """Give up a lane change if someone ahead is changing into the same lane; cars decide in the order of their rows."""
@@ -235,11 +242,13 @@ class Traffic(RoadUsers):
         :param aims: the lane each user steers for, shape ``(n,)``
         :return: True if it had better stay behind
         """
-        rivals = np.flatnonzero((aims == lane) & (self.lane != lane))
+        rivals = ((aims == lane) & (self.lane != lane)).nonzero()[0]
         rivals = rivals[rivals != row]
+        if not rivals.size:
+            return False
         distance = self.distance(np.full_like(rivals, row), rivals)
         closing = (self.velocity[row] - self.velocity[rivals]) @ self.direction[row]
-        _, _, gap, headway, braking = self._following[:, row]
+        _, _, gap, headway, braking = self._following[row]
         wanted = gap + self.speed[row] * headway + self.speed[row] * closing / braking
         return bool(np.any((distance > 0) & (distance < wanted)))
 
