@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -29,38 +28,11 @@ OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
 OUTLINE = 2  # nothing further outside than this leaves a trace in an image [px]
 
 
-class Shapes(NamedTuple):
-    """
-    Shapes that lie still, and the circles around them.
-
-    :param points: shape ``(n, k, 2)`` [m]
-    :param greys: shape ``(n,)``
-    :param centres: shape ``(n, 2)`` [m]
-    :param radii: shape ``(n,)`` [m]
-    """
-
-    points: Floats
-    greys: Ints
-    centres: Floats
-    radii: Floats
-
-    @classmethod
-    def of(cls, points: Floats, greys: Ints) -> "Shapes":
-        """
-        Circle shapes.
-
-        :param points: shape ``(n, k, 2)`` [m]
-        :param greys: shape ``(n,)``
-        :return: the shapes
-        """
-        centres = points.mean(1)
-        offset = points - centres[:, None]
-        return cls(points, greys, centres, np.hypot(offset[..., 0], offset[..., 1]).max(1, initial=0.0))
-
-
 class Ground:
     """
-    What does not move, as it is drawn: asphalt, brighter where the route leads, and painted lines.
+    What does not move, as quadrilaterals in the order in which they are drawn, and the circles around them.
+
+    Asphalt comes first, brighter where the route leads, then painted lines, whose first two corners are their ends.
 
     :param markings: of the road
     :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
@@ -68,8 +40,13 @@ class Ground:
 
     def __init__(self, markings: Markings, route: Bools) -> None:
         surfaces, on_route = markings.with_route_on_top(route)
-        self.asphalt = Shapes.of(surfaces, np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY))
-        self.paint = Shapes.of(markings.lines, np.where(markings.dashed, DASH_GREY, LINE_GREY))
+        self.corners = np.concatenate([surfaces, markings.lines[:, [0, 1, 1, 0]]])
+        asphalt, paint = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY), np.where(markings.dashed, DASH_GREY, LINE_GREY)
+        self.greys = np.concatenate([asphalt, paint])
+        self.is_line = np.arange(len(self.corners)) >= len(surfaces)
+        self.centres = self.corners.mean(1)
+        offset = self.corners - self.centres[:, None]
+        self.radii = np.hypot(offset[..., 0], offset[..., 1]).max(1)
 
 
 class Frame:
@@ -129,38 +106,30 @@ class View:
         """Of the circle around the image [m]."""
         self._limit = np.array([columns, rows]) * 2**SUBPIXEL_BITS
 
-    def visible(self, shapes: NDArray[np.int32]) -> list[int]:
+    def draw(
+        self,
+        images: Sequence[Image],
+        shapes: NDArray[np.int32],
+        colours: Sequence[Colour],
+        is_line: Sequence[bool],
+        thickness: int = 1,
+    ) -> None:
         """
-        Which shapes may have a part in the image.
+        Draw convex quadrilaterals and straight lines, one after the other.
 
-        :param shapes: pixel coordinates of n shapes of k points, shape ``(n, k, 2)`` [px / 16]
-        :return: their indices
+        :param images: the image each is drawn into, shape ``(rows, columns)`` or ``(rows, columns, 3)``
+        :param shapes: pixel coordinates, shape ``(n, 4, 2)`` [px / 16]
+        :param colours: one each
+        :param is_line: whether it is a line between its first two corners
+        :param thickness: of lines [px]
         """
-        seen = (shapes >= 0).any(1) & (shapes <= self._limit).any(1)
-        return seen.all(1).nonzero()[0].tolist()
-
-    def fill(self, images: Sequence[Image], shapes: NDArray[np.int32], colours: Sequence[Colour]) -> None:
-        """
-        Fill convex polygons.
-
-        :param images: the image each polygon is drawn into, shape ``(rows, columns)`` or ``(rows, columns, 3)``
-        :param shapes: pixel coordinates, shape ``(n, k, 2)`` [px / 16]
-        :param colours: one per polygon
-        """
-        for index in self.visible(shapes):
-            cv2.fillConvexPoly(images[index], shapes[index], colours[index], cv2.LINE_AA, SUBPIXEL_BITS)
-
-    def lines(self, image: Image, segments: NDArray[np.int32], colours: Sequence[Colour], thickness: int = 1) -> None:
-        """
-        Draw straight lines.
-
-        :param image: drawn into
-        :param segments: pixel coordinates, shape ``(n, 2, 2)`` [px / 16]
-        :param colours: one per line
-        :param thickness: [px]
-        """
-        for index in self.visible(segments):
-            cv2.polylines(image, [segments[index]], False, colours[index], thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+        seen = ((shapes >= 0).any(1) & (shapes <= self._limit).any(1)).all(1)  # OpenCV would do this more slowly
+        for index in seen.nonzero()[0].tolist():
+            image, shape, colour = images[index], shapes[index], colours[index]
+            if is_line[index]:
+                cv2.polylines(image, [shape[:2]], False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+            else:
+                cv2.fillConvexPoly(image, shape, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -229,19 +198,18 @@ class BirdsEyeView:
         :param heading: the direction that points up [rad]
         :return: the image, shape ``(3, rows, columns)``
         """
-        view, frame = self.view, Frame(self.view, traffic.position[EGO], heading)
-        image = np.zeros((3, *view.shape), dtype=np.uint8)
+        frame = Frame(self.view, traffic.position[EGO], heading)
+        image = np.zeros((3, *self.view.shape), dtype=np.uint8)
         road, users, obstacles = image
-        asphalt = frame.near(ground.asphalt.centres, ground.asphalt.radii)
-        rows = frame.near(traffic.position, traffic.radius)
+        still, rows = frame.near(ground.centres, ground.radii), frame.near(traffic.position, traffic.radius)
         moves = traffic.is_vehicle[rows] & (rows != EGO)
-        boxes = np.concatenate([stop_lines.corners, traffic.corners[rows]])
-        layers = [road] * len(asphalt) + [obstacles] * len(stop_lines.red)
+        layers = [road] * len(still) + [obstacles] * len(stop_lines.red)
         layers += [users if moving else obstacles for moving in moves.tolist()]
-        shapes = np.concatenate([frame.pixels(ground.asphalt.points[asphalt]), inset(frame.pixels(boxes))])
-        light = np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY)
-        view.fill(layers, shapes, np.concatenate([ground.asphalt.greys[asphalt], light, user_greys(traffic)[rows]]).tolist())
-        paint = frame.near(ground.paint.centres, ground.paint.radii)
-        view.lines(road, frame.pixels(ground.paint.points[paint]), ground.paint.greys[paint].tolist())
+        shapes = frame.pixels(np.concatenate([ground.corners[still], stop_lines.corners, traffic.corners[rows]]))
+        shapes[len(still) :] = inset(shapes[len(still) :])
+        lights = np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY)
+        greys = np.concatenate([ground.greys[still], lights, user_greys(traffic)[rows]])
+        is_line = ground.is_line[still].tolist() + [False] * (len(layers) - len(still))
+        self.view.draw(layers, shapes, greys.tolist(), is_line)
         draw_dial(obstacles, float(traffic.speed[EGO]))
         return image

@@ -85,7 +85,7 @@ class Braking(StraightDrive):
     def _car_beside(self) -> int:
         """A car in a lane beside the ego vehicle's, a little ahead, with nobody between them; -1 if there is none."""
         traffic, lane = self.traffic, self.traffic.lane[EGO]
-        beside = np.isin(traffic.lane, (self.road.left[lane], self.road.right[lane]))
+        beside = (traffic.lane == self.road.left[lane]) | (traffic.lane == self.road.right[lane])
         beside[traffic.outsiders] = False
         distance = traffic.position[:, 0] - traffic.position[EGO, 0]
         front = self._car_ahead()

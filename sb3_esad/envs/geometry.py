@@ -8,6 +8,8 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 AnyFloat = TypeVar("AnyFloat", float, Floats)
 
+_UNIT_CORNERS = np.array([[0.5, 0.5, -0.5, -0.5], [-0.5, 0.5, 0.5, -0.5]])[..., None]
+
 
 def wrap_angle(angle: AnyFloat) -> AnyFloat:
     """
@@ -41,6 +43,31 @@ def directions(heading: Floats) -> Floats:
     return np.array([np.cos(heading), np.sin(heading)]).T
 
 
+def outlines(size: Floats) -> Floats:
+    """
+    Corners of boxes in their own frames: front left, front right, rear right, rear left.
+
+    :param size: length and width, shape ``(n, 2)`` [m]
+    :return: how far ahead of the centre they are and how far to the right, shape ``(2, 4, n)`` [m]
+    """
+    return _UNIT_CORNERS * size.T[:, None]
+
+
+def placed(outline: Floats, position: Floats, direction: Floats) -> Floats:
+    """
+    Place boxes in the world.
+
+    :param outline: from :func:`outlines`, shape ``(2, 4, n)`` [m]
+    :param position: centres, shape ``(n, 2)`` [m]
+    :param direction: of the long side, unit vectors, shape ``(n, 2)``
+    :return: corners, shape ``(n, 4, 2)`` [m]
+    """
+    x, y = position.T
+    cos_sin = direction.T[:, None]
+    (ahead_cos, right_sin), (ahead_sin, right_cos) = outline * cos_sin, outline * cos_sin[::-1]
+    return np.array([x + ahead_cos - right_sin, y + ahead_sin + right_cos]).transpose(2, 1, 0)
+
+
 def box_corners(position: Floats, heading: Floats, size: Floats) -> Floats:
     """
     Corners of oriented boxes: front left, front right, rear right, rear left.
@@ -50,11 +77,7 @@ def box_corners(position: Floats, heading: Floats, size: Floats) -> Floats:
     :param size: length and width, shape ``(n, 2)`` [m]
     :return: corners, shape ``(n, 4, 2)`` [m]
     """
-    cos, sin = np.cos(heading), np.sin(heading)
-    length, width = size.T / 2
-    forward, right = length * np.array([cos, sin]), width * np.array([-sin, cos])
-    front, rear = position.T + forward, position.T - forward
-    return np.array([front - right, front + right, rear + right, rear - right]).transpose(2, 0, 1)
+    return placed(outlines(size), position, directions(heading))
 
 
 def boxes_overlap(box: Floats, others: Floats) -> NDArray[np.bool_]:

@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats, box_corners, directions
+from sb3_esad.envs.geometry import Floats, directions, outlines, placed
 from sb3_esad.envs.lanes import CAR_LENGTH, LANE_WIDTH, NO_LANE
 from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Kind, User
@@ -32,6 +32,9 @@ class LanesAhead(NamedTuple):
     start: Floats
 
 
+NOTHING_AHEAD = LanesAhead(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
+
+
 class RoadUsers:
     """
     Road users on a road, row ``EGO`` being the ego vehicle; positions are projected onto the lanes once per move.
@@ -47,6 +50,8 @@ class RoadUsers:
         self.heading = np.array([user.heading for user in users], dtype=np.float64)
         self.speed = np.array([user.speed for user in users], dtype=np.float64)
         self.size = np.array([user.size for user in users], dtype=np.float64, order="F")
+        self._outline = outlines(self.size)
+        self.half_length = self.size[:, 0] / 2
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
         self.kind = np.array([user.kind for user in users], dtype=np.int64)
         self.is_vehicle = self.kind == Kind.VEHICLE
@@ -60,6 +65,7 @@ class RoadUsers:
         self._any_on_foot = bool((self.kind == Kind.PERSON).any())
         self.next_lane, self.towards_path, self.leads_astray, off_path = self._follow_paths(users)
         self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T.copy()
+        self._goes_on = bool((self.next_lane != NO_LANE).any())
         self._following_lanes, self._starts = self._foresee_lanes()
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
@@ -108,8 +114,8 @@ class RoadUsers:
         road, count = self.road, len(self.speed)
         self.direction = directions(self.heading)
         self.velocity = self.speed[:, None] * self.direction
-        self.corners = box_corners(self.position, self.heading, self.size)
-        soon = self.position[self.outsiders] + INTENTION_HORIZON * self.velocity[self.outsiders]
+        self.corners = placed(self._outline, self.position, self.direction)
+        soon = (self.position + INTENTION_HORIZON * self.velocity)[self.outsiders]
         along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))
         aside, overshoot = np.abs(across), road.overshoot(along)
         self.along, self.across = along[:, :count], across[:, :count]
@@ -162,6 +168,8 @@ class RoadUsers:
         :param lanes: the lane from which each goes on, shape ``(n,)``
         :return: the lanes ahead of all of them
         """
+        if not self._goes_on:
+            return NOTHING_AHEAD
         following = self._following_lanes[rows, lanes]
         order, step = (following != NO_LANE).nonzero()
         return LanesAhead(order, following[order, step], self._starts[rows[order], lanes[order], step])
@@ -196,7 +204,7 @@ class RoadUsers:
         slip = np.arctan(0.5 * np.tan(self.wheel_angle))
         course = self.heading + slip
         self.position += self.speed[:, None] * directions(course) * dt
-        self.heading += self.speed * np.sin(slip) / (self.size[:, 0] / 2) * dt
+        self.heading += self.speed * np.sin(slip) / self.half_length * dt
         slowing = np.minimum(self.acceleration, TOP_SPEED - self.speed)
         acceleration = np.where(self.speed > TOP_SPEED, slowing, self.acceleration)
         self.speed = np.maximum(self.speed + acceleration * dt, 0.0)
@@ -211,9 +219,9 @@ def nearest_ahead(gap: Floats, there: Bools) -> Ints:
     :param there: whether it counts, shape ``(n, users)``
     :return: its row, -1 where there is nobody, shape ``(n,)``
     """
-    ahead = np.where(there & (gap >= 0), gap, np.inf)
-    nearest = ahead.argmin(1)
-    nearest[ahead.min(1) == np.inf] = -1
+    ahead = there & (gap >= 0)
+    nearest = np.where(ahead, gap, np.inf).argmin(1)
+    nearest[~ahead[np.arange(len(gap)), nearest]] = -1
     return nearest
 
 
@@ -225,7 +233,7 @@ def nearest_behind(gap: Floats, there: Bools) -> Ints:
     :param there: whether it counts, shape ``(n, users)``
     :return: its row, -1 where there is nobody, shape ``(n,)``
     """
-    behind = np.where(there & (gap < 0), gap, -np.inf)
-    nearest = behind.argmax(1)
-    nearest[behind.max(1) == -np.inf] = -1
+    behind = there & (gap < 0)
+    nearest = np.where(behind, gap, -np.inf).argmax(1)
+    nearest[~behind[np.arange(len(gap)), nearest]] = -1
     return nearest

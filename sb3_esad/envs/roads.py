@@ -59,8 +59,9 @@ class Road:
         self.heading = np.array([lane.heading for lane in lanes], dtype=np.float64)
         self.length = np.array([lane.length for lane in lanes], dtype=np.float64)
         self.curvature = np.array([lane.curvature for lane in lanes], dtype=np.float64)
-        self.direction = directions(self.heading)
+        self._origin, self._along = self.start.T[:, :, None].copy(), directions(self.heading).T[:, :, None]
         self.width = np.array([lane.width for lane in lanes])
+        self._half_width = self.width[:, None] / 2
         self.speed_limit = np.array([lane.speed_limit for lane in lanes])
         self.left = np.array([lane.left for lane in lanes])
         self.right = np.array([lane.right for lane in lanes])
@@ -86,10 +87,9 @@ class Road:
         :param position: points, shape ``(n, 2)`` [m]
         :return: distance along the lane from its start, and to the right of its centre, each ``(lanes, n)`` [m]
         """
-        x = position[:, 0] - self.start[:, :1]
-        y = position[:, 1] - self.start[:, 1:]
-        cos, sin = self.direction[:, :1], self.direction[:, 1:]
-        along, across = x * cos + y * sin, y * cos - x * sin
+        offset = position.T[:, None] - self._origin
+        (x_cos, y_sin), (y_cos, x_sin) = offset * self._along, offset[::-1] * self._along
+        along, across = x_cos + y_sin, y_cos - x_sin
         if self.arcs.size:
             along[self.arcs], across[self.arcs] = self._project_onto_arcs(position)
         return along, across
@@ -203,7 +203,7 @@ class Road:
         :param overshoot: from :meth:`overshoot`, shape ``(lanes, n)`` [m]
         :return: truth values, shape ``(n,)``
         """
-        return np.asarray(((aside <= self.width[:, None] / 2) & (overshoot == 0)).any(0))
+        return np.asarray(((aside <= self._half_width) & (overshoot == 0)).any(0))
 
     def room(self, lane: int, across: Floats) -> tuple[float, float]:
         """

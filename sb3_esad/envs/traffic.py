@@ -14,16 +14,12 @@ from sb3_esad.envs.users import Temper, User
 HEADING_GAIN, LATERAL_GAIN = 1 / 0.2, 1 / 0.6  # [1/s]
 MAX_WHEEL_ANGLE, MAX_APPROACH_ANGLE = np.pi / 3, np.pi / 4  # [rad]
 MAX_ACCELERATION = 6.0  # [m/s^2]
+LEAST = 0.01  # nothing is divided by a smaller speed or distance [m/s], [m]
 EASY_BRAKING = 2.0  # cars slow down like this for lanes with a lower limit [m/s^2]
 STOP_GAP, STOP_HEADWAY = CAR_LENGTH / 2 + 1.0, 0.3  # centre to line [m], [s]
 BLIND_BEHIND = 25.0  # nobody changes to a lane this near to its start, where who follows from the lane before is not seen [m]
 GET_BACK = 100.0  # from here on to the end of a lane it is time to be on the lane of one's path [m]
 PURSUIT = 0.1  # cars take the direction that their lane will have after this time [s]
-
-
-def not_zero(value: Floats) -> Floats:
-    """Keep values at least 0.01 away from zero, so that one can divide by them."""
-    return np.copysign(np.maximum(np.abs(value), 0.01), value)
 
 
 class Traffic(RoadUsers):
@@ -44,7 +40,7 @@ class Traffic(RoadUsers):
         self.temper = {f.name: np.array([getattr(user.temper, f.name) for user in users]) for f in fields(Temper)}
         own = self.temper
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
-        self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking], axis=-1)
+        self._following = (own["acceleration"], own["exponent"], own["gap"], own["headway"], braking)
         self.forced_braking = np.zeros(len(users))  # a scenario makes a car brake this hard, whatever it would do [m/s^2]
         self.stop_distance = np.full(len(users), np.inf)  # to a line before which a car must wait, from its centre [m]
         self._first_change = np.where(road.continues, BLIND_BEHIND, 0.0)  # from here on one may change to each lane [m]
@@ -73,10 +69,10 @@ class Traffic(RoadUsers):
         :param judges: the users whose temper is applied, shape ``(n,)``
         :return: accelerations, shape ``(n,)`` [m/s^2]
         """
-        acceleration, exponent, gap, headway, braking = self._following[judges].T
+        acceleration, exponent, gap, headway, braking = (each[judges] for each in self._following)
         speed = self.speed[rows]
-        desired = not_zero(np.minimum(self.target_speed[rows], self.speed_limit[rows]))
-        distance = not_zero(self.distance(rows, front))
+        desired = np.maximum(np.minimum(self.target_speed[rows], self.speed_limit[rows]), LEAST)
+        distance = np.maximum(np.abs(self.distance(rows, front)), LEAST)
         (east, south), (cos, sin) = self.velocity.T, self.direction.T
         closing = (east[rows] - east[front]) * cos[rows] + (south[rows] - south[front]) * sin[rows]
         wanted = gap + speed * headway + speed * closing / braking
@@ -91,9 +87,9 @@ class Traffic(RoadUsers):
         :return: infinite for who need not wait, shape ``(n,)`` [m/s^2]
         """
         distance, speed = self.stop_distance[rows], self.speed[rows]
-        acceleration, _, _, _, braking = self._following[rows].T
+        acceleration, _, _, _, braking = (each[rows] for each in self._following)
         wanted = STOP_GAP + STOP_HEADWAY * speed + speed**2 / braking
-        free = acceleration * (1.0 - (speed / not_zero(self.target_speed[rows])) ** 4)
+        free = acceleration * (1.0 - (speed / np.maximum(self.target_speed[rows], LEAST)) ** 4)
         stopping = free - acceleration * (wanted / np.maximum(distance, 0.1)) ** 2
         return np.where(distance < np.inf, stopping, np.inf)
 
@@ -140,18 +136,19 @@ class Traffic(RoadUsers):
         :param lateral_gain: how fast a lateral offset is corrected [1/s]
         :return: wheel angles, shape ``(n,)`` [rad]
         """
-        speed = not_zero(self.speed[rows])
+        speed = np.maximum(self.speed[rows], LEAST)
         approach = np.arcsin(bounded(-lateral_gain * self.across[lanes, rows] / speed, 1.0))
         ahead = self.road.heading_at(lanes, self.along[lanes, rows] + PURSUIT * self.speed[rows])
         wanted = ahead + bounded(approach, MAX_APPROACH_ANGLE)
         yaw_rate = heading_gain * wrap_angle(wanted - self.heading[rows])
-        slip = np.arcsin(bounded(self.size[rows, 0] / 2 / speed * yaw_rate, 1.0))
+        slip = np.arcsin(bounded(self.half_length[rows] / speed * yaw_rate, 1.0))
         return bounded(np.arctan(2 * np.tan(slip)), MAX_WHEEL_ANGLE)
 
     def act(self) -> None:
         """Let every self-driving car choose its lane, acceleration and wheel angle."""
         rows = self.drivers
-        self._continue_lanes(rows)
+        if self._goes_on:
+            self._continue_lanes(rows)
         self._choose_lanes(rows)
         target = self.target_lane[rows]
         self.wheel_angle[rows] = self.steering(rows, target)
@@ -248,7 +245,7 @@ class Traffic(RoadUsers):
             return False
         distance = self.distance(np.full_like(rivals, row), rivals)
         closing = (self.velocity[row] - self.velocity[rivals]) @ self.direction[row]
-        _, _, gap, headway, braking = self._following[row]
+        _, _, gap, headway, braking = (each[row] for each in self._following)
         wanted = gap + self.speed[row] * headway + self.speed[row] * closing / braking
         return bool(np.any((distance > 0) & (distance < wanted)))
 
