@@ -25,6 +25,7 @@ AMBER_GREY = 210  # of the line before an amber light
 DIAL_SPEED, DIAL_GREY = 32.0, 160  # the speed at which the dial is as high as the image [m/s]
 DIAL_SHARE = 1 / 16  # of the image's width, at either edge
 OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
+_NEXT_CORNER, _LAST_CORNER = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
 OUTLINE = 2  # nothing further outside than this leaves a trace in an image [px]
 
 
@@ -139,10 +140,10 @@ def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
     :param shapes: pixel coordinates of their corners in order, shape ``(n, 4, 2)`` [px / 16]
     :return: the same, smaller
     """
-    sides = shapes[:, [1, 2, 3, 0]] - shapes
+    sides = shapes[:, _NEXT_CORNER] - shapes
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1.0)
     steps = BLEED / lengths[..., None] * sides
-    return np.rint(shapes + steps - steps[:, [3, 0, 1, 2]]).astype(np.int32)
+    return np.rint(shapes + steps - steps[:, _LAST_CORNER]).astype(np.int32)
 
 
 def user_greys(traffic: Traffic) -> Ints:
@@ -168,10 +169,12 @@ def draw_dial(image: Image, speed: float) -> None:
     :param image: drawn into, shape ``(rows, columns)``
     :param speed: [m/s]
     """
-    height = min(speed / DIAL_SPEED, 1.0) * image.shape[0]
-    filled = np.minimum(np.maximum(height - np.arange(image.shape[0])[::-1], 0.0), 1.0)
-    width = max(1, round(DIAL_SHARE * image.shape[1]))
-    image[:, :width] = image[:, -width:] = np.rint(DIAL_GREY * filled).astype(np.uint8)[:, None]
+    rows, width = image.shape[0], max(1, round(DIAL_SHARE * image.shape[1]))
+    height = min(speed / DIAL_SPEED, 1.0) * rows
+    whole = int(height)
+    dial = np.zeros(rows + 1, dtype=np.uint8)  # one more, above the image, for the fraction of a pixel on top of a full dial
+    dial[rows + 1 - whole :], dial[rows - whole] = DIAL_GREY, round(DIAL_GREY * (height - whole))
+    image[:, :width] = image[:, -width:] = dial[1:, None]
 
 
 class BirdsEyeView:

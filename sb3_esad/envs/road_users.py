@@ -55,8 +55,8 @@ class RoadUsers:
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
         self.kind = np.array([user.kind for user in users], dtype=np.int64)
         self.is_vehicle = self.kind == Kind.VEHICLE
-        self.drivers = np.flatnonzero([user.drives for user in users])
-        self.outsiders = np.setdiff1d(np.arange(len(users)), self.drivers)
+        self.drives = np.array([user.drives for user in users])
+        self.drivers, self.outsiders = np.flatnonzero(self.drives), np.flatnonzero(~self.drives)
         self.acceleration = np.zeros(len(users))
         self.wheel_angle = np.zeros(len(users))
         self._rows = np.arange(len(users))
@@ -64,8 +64,9 @@ class RoadUsers:
         self._berth = road.width[:, None] / 2 + margin
         self._any_on_foot = bool((self.kind == Kind.PERSON).any())
         self.next_lane, self.towards_path, self.leads_astray, off_path = self._follow_paths(users)
-        self._handicap = np.concatenate([off_path, off_path[self.outsiders]]).T.copy()
-        self._goes_on = bool((self.next_lane != NO_LANE).any())
+        self._now_and_soon = np.concatenate([self._rows, self.outsiders])
+        self._handicap = off_path[self._now_and_soon].T.copy()
+        self._any_astray, self._goes_on = bool(self.leads_astray.any()), bool((self.next_lane != NO_LANE).any())
         self._following_lanes, self._starts = self._foresee_lanes()
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
@@ -121,8 +122,9 @@ class RoadUsers:
         self.along, self.across = along[:, :count], across[:, :count]
         self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)
         self.off_road = not all(road.covers(aside[:, -4:], overshoot[:, -4:]))
-        heading = np.concatenate([self.heading, self.heading[self.outsiders]])
-        lane = road.closest_lane(along[:, :-4], (aside + overshoot)[:, :-4], heading, self._handicap)
+        lane = road.closest_lane(
+            along[:, :-4], (aside + overshoot)[:, :-4], self.heading[self._now_and_soon], self._handicap
+        )
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
         self._note_intentions(aside[:, count:])
         self.ahead = self.lanes_ahead(self._rows, self.lane)

@@ -207,7 +207,8 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             self._check_crash()
             if self.crashed:
                 break
-        on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self._wrong_way()
+        self.wrong_way = abs(self.heading_error) > math.pi / 2
+        on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self.wrong_way
         self.episode.add_motion(duration, metres, self._progress(), on_route)
 
     def _check_crash(self) -> None:
@@ -219,9 +220,6 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         elif self.off_road:
             self.episode.add_infraction("static")
 
-    def _wrong_way(self) -> bool:
-        return abs(self.heading_error) > math.pi / 2
-
     def _cost_terms(self) -> dict[str, bool]:
         red_light = self._ran_red_light()
         if red_light:
@@ -229,7 +227,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return {
             "collision": self.collided,
             "off_road": self.off_road,
-            "wrong_way": self._wrong_way(),
+            "wrong_way": self.wrong_way,
             "red_light": red_light,
         }
 

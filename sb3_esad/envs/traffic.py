@@ -198,6 +198,8 @@ class Traffic(RoadUsers):
         :param lanes: the lane to judge for each of them, shape ``(n,)``
         :return: one verdict per user, shape ``(n,)``
         """
+        if not self._any_astray:
+            return np.zeros(len(rows), dtype=bool)
         left = self.road.length[lanes] - self.along[lanes, rows]
         return np.asarray(self.leads_astray[rows, lanes] & (left < GET_BACK))
 
