@@ -40,7 +40,7 @@ def directions(heading: Floats) -> Floats:
     :param heading: shape ``(n,)`` [rad]
     :return: shape ``(n, 2)``
     """
-    return np.array([np.cos(heading), np.sin(heading)]).T
+    return np.array([np.cos(heading), np.sin(heading)]).T.copy()
 
 
 def outlines(size: Floats) -> Floats:

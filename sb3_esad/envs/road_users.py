@@ -45,11 +45,10 @@ class RoadUsers:
 
     def __init__(self, road: Road, users: Sequence[User]) -> None:
         self.road = road
-        # Two columns, each of them contiguous: numpy is slow on pairs.
-        self.position = np.array([user.position for user in users], dtype=np.float64, order="F")
+        self.position = np.array([user.position for user in users], dtype=np.float64)
         self.heading = np.array([user.heading for user in users], dtype=np.float64)
         self.speed = np.array([user.speed for user in users], dtype=np.float64)
-        self.size = np.array([user.size for user in users], dtype=np.float64, order="F")
+        self.size = np.array([user.size for user in users], dtype=np.float64)
         self._outline = outlines(self.size)
         self.half_length = self.size[:, 0] / 2
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
