@@ -1,12 +1,12 @@
 """All road users as arrays: their bodies, how they move, and where they are on the lanes."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
 
 from sb3_esad.envs.geometry import Floats, directions, outlines, placed
-from sb3_esad.envs.lanes import CAR_LENGTH, LANE_WIDTH, NO_LANE
+from sb3_esad.envs.lanes import CAR_LENGTH, LANE_WIDTH
+from sb3_esad.envs.paths import Outlook, Paths
 from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Kind, User
 
@@ -14,25 +14,6 @@ EGO = 0  # row of the ego vehicle in every array
 TOP_SPEED = 40.0  # [m/s]
 LANE_MARGIN = 1.0  # who moves and is this far past the line still counts as being in the lane [m]
 INTENTION_HORIZON = 1.5  # others read where the ego vehicle is going from where it will be after this time [s]
-OFF_PATH = 1.5  # where lanes overlap, one is on that of one's path even if another is as much nearer [m]
-LOOKAHEAD = 3  # lanes that are looked into beyond the present one
-
-
-class LanesAhead(NamedTuple):
-    """
-    Lanes that some users will take after given ones, those of each user in order, the furthest first.
-
-    :param order: the place of the user among them, shape ``(n,)``
-    :param lane: shape ``(n,)``
-    :param start: how far it starts from the start of the lane from which the user comes, shape ``(n,)`` [m]
-    """
-
-    order: Ints
-    lane: Ints
-    start: Floats
-
-
-NOTHING_AHEAD = LanesAhead(np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0))
 
 
 class RoadUsers:
@@ -62,53 +43,12 @@ class RoadUsers:
         margin = np.where(self.kind == Kind.STATIC, self.size[:, 1] / 2, LANE_MARGIN)
         self._berth = road.width[:, None] / 2 + margin
         self._any_on_foot = bool((self.kind == Kind.PERSON).any())
-        self.next_lane, self.towards_path, self.leads_astray, off_path = self._follow_paths(users)
+        self.paths = Paths(road, users)
         self._now_and_soon = np.concatenate([self._rows, self.outsiders])
-        self._handicap = off_path[self._now_and_soon].T.copy()
-        self._any_astray, self._goes_on = bool(self.leads_astray.any()), bool((self.next_lane != NO_LANE).any())
-        self._following_lanes, self._starts = self._foresee_lanes()
+        self._handicap = self.paths.handicap[self._now_and_soon].T.copy()
         self.target_lane = np.zeros(len(users), dtype=np.int64)
         self._locate()
         self.target_lane[:] = self.lane
-
-    def _follow_paths(self, users: Sequence[User]) -> tuple[Ints, Ints, Bools, Floats]:
-        """
-        Read the paths; each array of shape ``(users, lanes)``.
-
-        :return: the lane that each user takes after each lane; the one to change to from there in order to be on its path;
-            whether the lane is beside the path but does not lead on to where the path goes; and what keeps the user off lanes
-            that it will not take [m]
-        """
-        road = self.road
-        following, towards = (np.tile(each, (len(users), 1)) for each in (road.following, np.arange(len(road.length))))
-        astray, off_path = np.zeros(following.shape, dtype=bool), np.zeros(following.shape)
-        for row, user in enumerate(users):
-            if user.path:
-                path, wanted = np.array(user.path[:-1], dtype=np.int64), np.array(user.path[1:], dtype=np.int64)
-                beside = road.row_of[road.following[path]] == road.row_of[wanted]  # there one changes lane instead
-                turns = (road.following[path] == NO_LANE) | ~beside
-                following[row, path[turns]] = wanted[turns]
-                towards[row] = road.towards(user.path)
-                astray[row] = road.leads_astray(user.path)
-                off_path[row] = OFF_PATH
-                off_path[row, list(road.with_lanes_beside(user.path))] = 0.0
-        return following, towards, astray, off_path
-
-    def _foresee_lanes(self) -> tuple[Ints, Floats]:
-        """
-        Go on from every lane, as each user would; the furthest comes first in each array.
-
-        :return: the lanes, ``NO_LANE`` after the last one, and how far their starts are from the start of the first [m]; each
-            of shape ``(users, lanes, LOOKAHEAD)``
-        """
-        lanes, passed = np.broadcast_to(np.arange(len(self.road.length)), self.next_lane.shape), np.zeros(self.next_lane.shape)
-        ahead, starts = [], []
-        for _ in range(LOOKAHEAD):
-            passed = passed + self.road.length[lanes]
-            lanes = np.where(lanes == NO_LANE, NO_LANE, self.next_lane[self._rows[:, None], lanes])
-            ahead.append(lanes)
-            starts.append(passed)
-        return np.stack(ahead[::-1], axis=-1), np.stack(starts[::-1], axis=-1)
 
     def _locate(self) -> None:
         road, count = self.road, len(self.speed)
@@ -126,8 +66,8 @@ class RoadUsers:
         )
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
         self._note_intentions(aside[:, count:])
-        self.ahead = self.lanes_ahead(self._rows, self.lane)
-        self.gap, there = self._look(self._rows, self.lane, self.ahead)
+        self.outlook = self.paths.outlook(self._rows, self.lane)
+        self.gap, there = self.gaps(self.outlook)
         self.front = nearest_ahead(self.gap, there)
 
     def _note_intentions(self, soon_aside: Floats) -> None:
@@ -138,42 +78,25 @@ class RoadUsers:
             rows = rows[(self.kind[rows] != Kind.PERSON) | (soon_off <= LANE_WIDTH / 2)]
         self.present[self.target_lane[rows], rows] = True
 
-    def gaps(self, rows: Ints, lanes: Ints) -> tuple[Floats, Bools]:
+    def gaps(self, outlook: Outlook) -> tuple[Floats, Bools]:
         """
-        Place everybody along given lanes and those that some users take after them.
+        Place everybody along the lanes that some users look along.
 
-        :param rows: users, shape ``(n,)``
-        :param lanes: the lane to look at for each of them, shape ``(n,)``
-        :return: how far everybody is ahead of each of them, by the projection onto the lane of who is on none of these [m]; and
+        :param outlook: of n users
+        :return: how far everybody is ahead of each of them, by the projection onto its first lane of who is on none of them [m]; and
             whether it is somebody else who is on one of them; each ``(n, users)``
         """
-        return self._look(rows, lanes, self.lanes_ahead(rows, lanes))
-
-    def _look(self, rows: Ints, lanes: Ints, ahead: LanesAhead) -> tuple[Floats, Bools]:
-        place, there = self.along[lanes], self.present[lanes]
-        if ahead.order.size:
-            seen, others = self.present[ahead.lane].nonzero()
-            beyond = ~there[ahead.order[seen], others]
+        place, there = self.along[outlook.lanes], self.present[outlook.lanes]
+        if outlook.order.size:
+            seen, others = self.present[outlook.further].nonzero()
+            beyond = ~there[outlook.order[seen], others]
             seen, others = seen[beyond], others[beyond]
-            order, distance = ahead.order[seen], ahead.start[seen] + self.along[ahead.lane[seen], others]
-            place[order, others], there[order, others] = distance, True  # the nearest lane comes last and wins
-        order = np.arange(len(rows))
-        there[order, rows] = False
-        return place - place[order, rows][:, None], there
-
-    def lanes_ahead(self, rows: Ints, lanes: Ints) -> LanesAhead:
-        """
-        Go on from lane to lane, as users take them.
-
-        :param rows: users, shape ``(n,)``
-        :param lanes: the lane from which each goes on, shape ``(n,)``
-        :return: the lanes ahead of all of them
-        """
-        if not self._goes_on:
-            return NOTHING_AHEAD
-        following = self._following_lanes[rows, lanes]
-        order, step = (following != NO_LANE).nonzero()
-        return LanesAhead(order, following[order, step], self._starts[rows[order], lanes[order], step])
+            where = outlook.order[seen], others
+            place[where] = outlook.starts[seen] + self.along[outlook.further[seen], others]  # the nearest comes last and wins
+            there[where] = True
+        themselves = np.arange(len(place)), outlook.rows
+        there[themselves] = False
+        return place - place[themselves][:, None], there
 
     def neighbours(self, rows: Ints, lanes: Ints) -> tuple[Ints, Ints]:
         """
@@ -183,7 +106,7 @@ class RoadUsers:
         :param lanes: the lane to look at for each of them, shape ``(n,)``
         :return: rows of those ahead and of those behind, each ``(n,)``, -1 where there is nobody
         """
-        gap, there = self.gaps(rows, lanes)
+        gap, there = self.gaps(self.paths.outlook(rows, lanes))
         return nearest_ahead(gap, there), nearest_behind(gap, there)
 
     def distance(self, rows: Ints, others: Ints) -> Floats:

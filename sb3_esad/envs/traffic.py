@@ -54,10 +54,10 @@ class Traffic(RoadUsers):
         """The speed from which each user can still slow down in time for the lanes ahead, shape ``(n,)``."""
         limits = self.road.speed_limit
         limit = limits[self.lane]
-        rows, lanes, start = self.ahead
+        _, _, rows, further, starts = self.outlook
         if rows.size:
-            distance = np.maximum(start - self.along[self.lane[rows], rows], 0.0)
-            np.minimum.at(limit, rows, np.sqrt(limits[lanes] ** 2 + 2 * EASY_BRAKING * distance))
+            distance = np.maximum(starts - self.along[self.lane[rows], rows], 0.0)
+            np.minimum.at(limit, rows, np.sqrt(limits[further] ** 2 + 2 * EASY_BRAKING * distance))
         return limit
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
@@ -147,8 +147,7 @@ class Traffic(RoadUsers):
     def act(self) -> None:
         """Let every self-driving car choose its lane, acceleration and wheel angle."""
         rows = self.drivers
-        if self._goes_on:
-            self._continue_lanes(rows)
+        self._continue_lanes(rows)
         self._choose_lanes(rows)
         target = self.target_lane[rows]
         self.wheel_angle[rows] = self.steering(rows, target)
@@ -165,7 +164,7 @@ class Traffic(RoadUsers):
         if not changing.size:
             return self.following_acceleration(rows, self.front[rows], rows)
         cars = rows[changing]
-        front = nearest_ahead(*self.gaps(cars, target[changing]))
+        front = nearest_ahead(*self.gaps(self.paths.outlook(cars, target[changing])))
         everyone = np.concatenate([rows, cars])
         acceleration = self.following_acceleration(everyone, np.concatenate([self.front[rows], front]), everyone)
         acceleration[changing] = np.minimum(acceleration[changing], acceleration[len(rows) :])
@@ -173,7 +172,7 @@ class Traffic(RoadUsers):
 
     def _continue_lanes(self, rows: Ints) -> None:
         target = self.target_lane[rows]
-        following = self.next_lane[rows, target]
+        following = self.paths.next_lane[rows, target]
         done = (following != NO_LANE) & (self.along[target, rows] > self.road.length[target] - CAR_LENGTH / 2)
         self.target_lane[rows[done]] = following[done]
 
@@ -198,10 +197,10 @@ class Traffic(RoadUsers):
         :param lanes: the lane to judge for each of them, shape ``(n,)``
         :return: one verdict per user, shape ``(n,)``
         """
-        if not self._any_astray:
+        if not self.paths.any_leads_astray:
             return np.zeros(len(rows), dtype=bool)
         left = self.road.length[lanes] - self.along[lanes, rows]
-        return np.asarray(self.leads_astray[rows, lanes] & (left < GET_BACK))
+        return np.asarray(self.paths.leads_astray[rows, lanes] & (left < GET_BACK))
 
     def _ponder(self, rows: Ints) -> None:
         cars = np.concatenate([rows, rows])
@@ -213,7 +212,7 @@ class Traffic(RoadUsers):
             self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
 
     def _get_back(self, rows: Ints) -> None:
-        lanes = self.towards_path[rows, self.lane[rows]]
+        lanes = self.paths.towards[rows, self.lane[rows]]
         possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
         rows, lanes = rows[possible], lanes[possible]
         if rows.size:
