@@ -19,8 +19,8 @@ def users_hit(traffic: Traffic) -> Ints:
     :param traffic: all road users
     :return: their rows
     """
-    offset = traffic.position - traffic.position[EGO]
-    near = np.hypot(offset[:, 0], offset[:, 1]) <= traffic.radius + traffic.radius[EGO]
+    x, y = (traffic.position - traffic.position[EGO]).T
+    near = np.hypot(x, y) <= traffic.radius + traffic.radius[EGO]
     rows = near.nonzero()[0][1:]  # the ego vehicle comes first
     return rows[boxes_overlap(traffic.corners[EGO], traffic.corners[rows])] if rows.size else rows
 
@@ -71,10 +71,8 @@ def time_to_collision(traffic: Traffic | Bodies) -> float:
     :param traffic: all road users
     :return: infinite if nothing in the path is being approached [s]
     """
-    offset = traffic.position - traffic.position[EGO]
-    cos, sin = traffic.direction[EGO]
-    ahead = offset[:, 0] * cos + offset[:, 1] * sin
-    across = offset[:, 1] * cos - offset[:, 0] * sin
+    (x, y), (cos, sin) = (traffic.position - traffic.position[EGO]).T, traffic.direction[EGO]
+    ahead, across = x * cos + y * sin, y * cos - x * sin
     closing = traffic.speed[EGO] - traffic.velocity @ traffic.direction[EGO]
     beside = (traffic.size[:, 1] + traffic.size[EGO, 1]) / 2
     rows = ((np.abs(across) < beside) & (ahead > 0) & (closing > 0)).nonzero()[0]

@@ -114,11 +114,11 @@ class Traffic(RoadUsers):
         :param lanes: the lane each considers, shape ``(n,)``
         :return: one verdict per user, shape ``(n,)``
         """
-        both = self.neighbours(np.concatenate([rows, rows]), np.concatenate([lanes, self.lane[rows]]))
-        (new_front, old_front), (new_rear, old_rear) = (each.reshape(2, -1) for each in both)
+        front, rear = self.neighbours(np.concatenate([rows, rows]), np.concatenate([lanes, self.lane[rows]]))
+        new_front, old_front, new_rear, old_rear = *front.reshape(2, -1), *rear.reshape(2, -1)
         who = np.concatenate([new_rear, new_rear, rows, rows, old_rear, old_rear])
-        front = np.concatenate([new_front, rows, new_front, old_front, rows, old_front])
-        outcomes = self.following_acceleration(who, front, np.concatenate([rows] * 6)).reshape(6, -1)
+        whom = np.concatenate([new_front, rows, new_front, old_front, rows, old_front])
+        outcomes = self.following_acceleration(who, whom, np.concatenate([rows] * 6)).reshape(6, -1)
         rear_now, rear_then, own_then, own_now, left_now, left_then = outcomes
         others = rear_then - rear_now + left_then - left_now
         advantage = own_then - own_now + self.temper["politeness"][rows] * others
@@ -155,8 +155,9 @@ class Traffic(RoadUsers):
         waiting = (self.stop_distance[rows] < np.inf).nonzero()[0]
         if waiting.size:
             acceleration[waiting] = np.minimum(acceleration[waiting], self.stopping_acceleration(rows[waiting]))
-        forced = self.forced_braking[rows]
-        self.acceleration[rows] = np.where(forced > 0.0, -forced, bounded(acceleration, MAX_ACCELERATION))
+        self.acceleration[rows] = bounded(acceleration, MAX_ACCELERATION)
+        forced = self.forced_braking.nonzero()[0]
+        self.acceleration[forced] = -self.forced_braking[forced]
 
     def _follow(self, rows: Ints, target: Ints) -> Floats:
         """Accelerations behind who is ahead in the own lane and, if that is another one, in the target lane, too."""
@@ -184,8 +185,7 @@ class Traffic(RoadUsers):
             self.timer[pondering] = 0.0
             due = self.must_get_back(pondering, self.lane[pondering])
             self._ponder(pondering[~due])
-            if due.any():
-                self._get_back(pondering[due])
+            self._get_back(pondering[due])
         for row in rows[changing].tolist():
             self._reconsider(row, before)
 
@@ -203,8 +203,8 @@ class Traffic(RoadUsers):
         return np.asarray(self.paths.leads_astray[rows, lanes] & (left < GET_BACK))
 
     def _ponder(self, rows: Ints) -> None:
-        cars = np.concatenate([rows, rows])
-        lanes = np.concatenate([self.road.left[self.lane[rows]], self.road.right[self.lane[rows]]])
+        own, cars = self.lane[rows], np.concatenate([rows, rows])
+        lanes = np.concatenate([self.road.left[own], self.road.right[own]])
         possible = (lanes != NO_LANE) & self._can_change(cars, lanes) & ~self.must_get_back(cars, lanes)
         cars, lanes = cars[possible], lanes[possible]
         if cars.size:
@@ -212,10 +212,10 @@ class Traffic(RoadUsers):
             self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
 
     def _get_back(self, rows: Ints) -> None:
-        lanes = self.paths.towards[rows, self.lane[rows]]
-        possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
-        rows, lanes = rows[possible], lanes[possible]
         if rows.size:
+            lanes = self.paths.towards[rows, self.lane[rows]]
+            possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
+            rows, lanes = rows[possible], lanes[possible]
             safe = self.change_is_safe(rows, lanes)
             self.target_lane[rows[safe]] = lanes[safe]
 
