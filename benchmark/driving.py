@@ -20,7 +20,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_esad import ESADLEND, WCSAC, SACLag
+from sb3_esad import ADEND, ESADLEND, SADLEN, WCSAC, SACLag
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.hyperparams import load_hyperparams
@@ -87,6 +87,8 @@ def sac(env_id: str, seed: int, changes: dict[str, Any]) -> SAC:
 
 ALGORITHMS: dict[str, Callable[[str, int, dict[str, Any]], OffPolicyAlgorithm]] = {
     "esad_lend": partial(tuned, ESADLEND, "esad_lend"),
+    "sad_len": partial(tuned, SADLEN, "sad_len"),
+    "ad_end": partial(tuned, ADEND, "ad_end"),
     "wcsac": partial(tuned, WCSAC, "wcsac"),
     "sac_lag": partial(tuned, SACLag, "sac_lag"),
     "sac": sac,

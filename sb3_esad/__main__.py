@@ -1,8 +1,9 @@
-"""The command line: ``python -m sb3_esad evaluate | demo``."""
+"""The command line: ``python -m sb3_esad evaluate | demo``, and RL Zoo's commands."""
 
 import argparse
 import sys
 from collections.abc import Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import gymnasium
@@ -15,6 +16,20 @@ from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.report import format_table, summarise_any, write_json
 from sb3_esad.video import record_driver, record_explanation, record_model
+
+ZOO_COMMANDS = {
+    "train": "train an agent",
+    "optimize": "search for settings that keep the cost limit",
+    "enjoy": "watch an agent",
+    "record_video": "film an agent",
+    "record_training": "film how an agent became what it is",
+    "plot_train": "plot the episodes of trainings",
+    "all_plots": "plot evaluations of trainings, their costs too",
+    "push_to_hub": "share an agent",
+    "load_from_hub": "fetch an agent that somebody has shared",
+}
+"""Commands that take RL Zoo's options."""
+ZOO_PACKAGES = ("rl_zoo3", "requests", "seaborn", "moviepy", "imageio_ffmpeg")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -47,6 +62,9 @@ def make_parser() -> argparse.ArgumentParser:
     _add_evaluate(commands.add_parser("evaluate", help="drive episodes with a model or a scripted driver, print the metrics"))
     _add_explain(commands.add_parser("explain", help="film an episode beside what the model thinks of it"))
     _add_demo(commands.add_parser("demo", help="train briefly, evaluate, write model, learning curve, results and video"))
+    for name, text in ZOO_COMMANDS.items():
+        # No word starts with a null, so all of them are handed on, --help too
+        _add_zoo(commands.add_parser(name, help=f"{text} (RL Zoo)", add_help=False, prefix_chars="\0"))
     return parser
 
 
@@ -125,6 +143,20 @@ def _add_demo(parser: argparse.ArgumentParser) -> None:
 def _demo(args: argparse.Namespace) -> None:
     th.set_num_threads(args.threads)
     run_demo(args.out, args.seed, args.timesteps, args.minutes, args.episodes, args.env)
+
+
+def _add_zoo(parser: argparse.ArgumentParser) -> None:
+    parser.set_defaults(run=_zoo)
+    parser.add_argument("words", nargs=argparse.REMAINDER)
+
+
+def _zoo(args: argparse.Namespace) -> None:
+    missing = [name for name in ZOO_PACKAGES if find_spec(name) is None]
+    if missing:
+        raise ImportError(f"RL Zoo's commands need {', '.join(missing)}: pip install 'sb3_esad[zoo]'.")
+    from sb3_esad.zoo.commands import run  # takes seconds
+
+    run(args.command, args.words)
 
 
 def _positive(text: str) -> int:

@@ -1,7 +1,7 @@
 """Evaluation on chosen seeds: every episode is driven once and to its end, whoever drives."""
 
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -78,7 +78,12 @@ class SeededEpisodes(gym.Wrapper[Any, Any, Any, Any]):
 
 
 def evaluate_model(
-    model: BaseAlgorithm, env_id: str, seeds: Sequence[int], deterministic: bool = True, n_envs: int = 20
+    model: BaseAlgorithm,
+    env_id: str,
+    seeds: Sequence[int],
+    deterministic: bool = True,
+    n_envs: int = 20,
+    env_kwargs: Mapping[str, Any] | None = None,
 ) -> list[Record]:
     """
     Let a model drive several environments side by side.
@@ -91,14 +96,15 @@ def evaluate_model(
     :param seeds: of the episodes
     :param deterministic: take the best action, not a sampled one
     :param n_envs: number of environments, at most one for each seed
+    :param env_kwargs: further arguments of the environment
     :return: one record for each seed, in their order
     :raises ValueError: if there are no seeds, or if the model was trained on other observations or actions
     """
     if not seeds:
         raise ValueError("There are no seeds to evaluate; give at least one.")
     n_envs = min(n_envs, len(seeds))
-    cost_key = getattr(model, "cost_key", "cost")
-    dummy_env = DummyVecEnv([partial(_make, env_id, seeds[first::n_envs], cost_key) for first in range(n_envs)])
+    make = partial(_make, env_id, cost_key=getattr(model, "cost_key", "cost"), env_kwargs=env_kwargs)
+    dummy_env = DummyVecEnv([partial(make, seeds[first::n_envs]) for first in range(n_envs)])
     envs: list[Any] = dummy_env.envs
     vec_env = stack_frames(BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False), model.observation_space)
     check_spaces(model, vec_env, env_id)
@@ -180,5 +186,7 @@ def check_spaces(model: BaseAlgorithm, env: VecEnv | gym.Env[Any, Any], env_id: 
             )
 
 
-def _make(env_id: str, seeds: Sequence[int], cost_key: str = "cost") -> SeededEpisodes:
-    return SeededEpisodes(gym.make(env_id), seeds, cost_key)
+def _make(
+    env_id: str, seeds: Sequence[int], cost_key: str = "cost", env_kwargs: Mapping[str, Any] | None = None
+) -> SeededEpisodes:
+    return SeededEpisodes(gym.make(env_id, **(env_kwargs or {})), seeds, cost_key)

@@ -1,6 +1,9 @@
 """Fixtures and worlds with known answers."""
 
+import resource
+from collections import OrderedDict
 from collections.abc import Iterator
+from pathlib import Path
 from typing import Any
 
 import gymnasium as gym
@@ -8,7 +11,12 @@ import numpy as np
 import pytest
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.utils import set_random_seed
+from stable_baselines3.common.vec_env import DummyVecEnv
+
+from sb3_esad import ESADLEND
+from sb3_esad.common.policies import LatentPolicy
 
 TINY: dict[str, Any] = {
     "policy_kwargs": {"net_arch": [16], "memory_channels": 8, "latent_channels": 4},
@@ -110,3 +118,49 @@ PICTURE = spaces.Box(0, 255, (36, 40, 3), np.uint8)
 VECTOR = spaces.Box(-1.0, 1.0, (3,), np.float32)
 SPACES: dict[str, spaces.Space] = {"MlpPolicy": VECTOR, "CnnPolicy": PICTURE, "MultiInputPolicy": VIEWS}
 """An observation space for each policy."""
+
+
+def make_env(policy: str = "MlpPolicy", n_envs: int = 1) -> DummyVecEnv:
+    return DummyVecEnv([lambda: RandomEnv(SPACES[policy])] * n_envs)
+
+
+def actions_of(model: BaseAlgorithm) -> np.ndarray:
+    """What the model does in some fixed situation, two steps long."""
+    model.observation_space.seed(0)
+    first, second = model.observation_space.sample(), model.observation_space.sample()
+    one, state = model.predict(first, deterministic=True)
+    other, _ = model.predict(second, state, deterministic=True)
+    return np.concatenate([one, other])
+
+
+def assert_same(one: Any, other: Any) -> None:
+    """Equality of nested dictionaries and lists of tensors."""
+    if isinstance(one, dict):
+        assert one.keys() == other.keys()
+        for key in one:
+            assert_same(one[key], other[key])
+    elif isinstance(one, list | tuple):
+        for each in zip(one, other, strict=True):
+            assert_same(*each)
+    elif isinstance(one, th.Tensor):
+        assert th.equal(one, other)
+    else:
+        assert one == other
+
+
+@pytest.fixture(scope="module")
+def trace(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Where code leaves a trace if it is run."""
+    return tmp_path_factory.mktemp("bombs") / "exploded"
+
+
+@pytest.fixture(scope="module")
+def nothing_else_happens(trace: Path) -> Iterator[None]:
+    """No code is run, no class is changed and no memory is filled by what the tests of a module open."""
+    watched = (*ESADLEND.__mro__, *LatentPolicy.__mro__, th.nn.Parameter, th.optim.Optimizer, th.FloatStorage, OrderedDict)
+    names = {each: set(dir(each)) for each in watched}
+    memory = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    yield
+    assert not trace.exists()
+    assert {name for each in watched for name in names[each] ^ set(dir(each))} <= {"__slotnames__"}  # a note of copyreg's
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - memory < 500_000  # kB

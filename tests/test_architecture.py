@@ -14,6 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     "common.type_aliases common.functional common.transforms common.torch_layers common.target_networks common.optimizers",
     "common.precision common.checks common.memory common.schedules common.side_by_side common.noise",
+    "common.plain_values common.plain_zip",
     "common.costs common.six_values common.frames common.windows common.cost_buffers common.buffers",
     "common.recent_sums",
     "common.episode_record common.penalties common.multipliers common.entropy",
@@ -23,12 +24,13 @@ LAYERS = [
     "common.imagined_returns common.agent",
     "common.foresight",
     "common.selection",
-    "common.policies common.callbacks common.evaluation common.save_util common.whole_files",
+    "common.policies common.callbacks common.evaluation common.save_util",
+    "common.description common.untrusted common.whole_files",
     "common.cost_aware_algorithm common.cost_limited_algorithm",
     "common.recurrent_algorithm common.latent_algorithm common.constrained_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",
     "",  # the package itself, which re-exports
-    "driving_evaluation report dream explanation panels progress hyperparams",
+    "driving_evaluation report dream explanation panels progress hyperparams algorithms",
     "moments plots",
     "video",
     "demo zoo benchmark",

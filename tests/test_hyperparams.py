@@ -8,13 +8,12 @@ import gymnasium as gym
 import pytest
 from conftest import CountingEnv
 from stable_baselines3 import SAC
-from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
-from sb3_esad import ESADLEND, WCSAC, SACLag, hyperparams
+from sb3_esad import ESADLEND, hyperparams
+from sb3_esad.algorithms import ALGORITHMS
 from sb3_esad.hyperparams import RUN_KEYS, Hyperparams, check_keys, constructor_arguments, load_hyperparams, read_entries
 
-ALGORITHMS: dict[str, type[BaseAlgorithm]] = {"esad_lend": ESADLEND, "wcsac": WCSAC, "sac_lag": SACLag}
 FOLDER = hyperparams.hyperparams_folder()
 ENTRIES = [(path.stem, env_id) for path in sorted(FOLDER.glob("*.yml")) for env_id in read_entries(path)]
 

@@ -17,11 +17,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv
 from sb3_esad import ESADLEND
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.policies import LatentPolicy
-from tests.conftest import PICTURE, SPACES, TINY, VECTOR, CountingEnv, RandomEnv
-
-
-def make_env(policy: str, n_envs: int = 1) -> DummyVecEnv:
-    return DummyVecEnv([lambda: RandomEnv(SPACES[policy])] * n_envs)
+from tests.conftest import PICTURE, SPACES, TINY, VECTOR, CountingEnv, RandomEnv, actions_of, assert_same, make_env
 
 
 def multiplier_of(model: ESADLEND) -> th.Tensor:
@@ -31,30 +27,6 @@ def multiplier_of(model: ESADLEND) -> th.Tensor:
 
 def train(policy: str = "MlpPolicy", n_envs: int = 1, steps: int = 32, **kwargs: Any) -> ESADLEND:
     return ESADLEND(policy, make_env(policy, n_envs), **{**TINY, "penalty_warmup": 0, **kwargs}).learn(steps)
-
-
-def actions_of(model: ESADLEND) -> np.ndarray:
-    """What the model does in some fixed situation, two steps long."""
-    model.observation_space.seed(0)
-    first, second = model.observation_space.sample(), model.observation_space.sample()
-    one, state = model.predict(first, deterministic=True)
-    other, _ = model.predict(second, state, deterministic=True)
-    return np.concatenate([one, other])
-
-
-def assert_same(one: Any, other: Any) -> None:
-    """Equality of nested dictionaries and lists of tensors."""
-    if isinstance(one, dict):
-        assert one.keys() == other.keys()
-        for key in one:
-            assert_same(one[key], other[key])
-    elif isinstance(one, list | tuple):
-        for each in zip(one, other, strict=True):
-            assert_same(*each)
-    elif isinstance(one, th.Tensor):
-        assert th.equal(one, other)
-    else:
-        assert one == other
 
 
 @pytest.mark.parametrize("policy", SPACES)

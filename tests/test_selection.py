@@ -71,11 +71,11 @@ def test_only_what_is_not_admissible_is_replaced_by_the_best_that_is(agent: Late
 
 def test_the_choice_is_that_of_brute_force(agent: LatentAgent) -> None:
     n = 6
-    safety = make_filter(calm=0.2, n_proposals=40)
+    safety = make_filter(calm=0.2)
     seen = belief(agent, n)
     th.manual_seed(3)
     proposals = safety._proposals(agent, seen.state, th.full((n, 1), -0.9))
-    assert proposals.shape == (40, n, 1)
+    assert proposals.shape == (5, n, 1)
     th.manual_seed(3)
     actions, helpless = safety._choose(agent, seen.state.map(lambda field: field[None]), seen.state, th.full((n, 1), -0.9))
     for state in range(n):
@@ -90,7 +90,7 @@ def test_where_nothing_is_admissible_the_least_risk_is_taken(agent: LatentAgent)
     safety = make_filter(calm=5.0)
     selection = safety.select(agent, belief(agent, 4), th.zeros(4, 1))
     assert selection.helpless.all() and selection.intervened.all()
-    assert (selection.actions > 0.8).all()  # of 64 uniform actions the highest four
+    assert (selection.actions > 0.5).all()  # the highest of 16 uniform actions, at least
 
 
 @pytest.mark.parametrize(("risk_level", "expected"), [(0.25, 4.0), (0.5, 3.5), (0.6, 3.0), (1.0, 2.5)])

@@ -12,7 +12,7 @@ from sb3_esad.common.functional import barrier_residual
 from sb3_esad.common.latent_algorithm import FALLING_RATE, LatentAlgorithm
 from sb3_esad.common.penalties import Penalty
 from sb3_esad.common.policies import LatentPolicy
-from sb3_esad.common.selection import BEST_UNIFORM, ActionFilter, NoFilter, SafetyFilter, SelectionRates
+from sb3_esad.common.selection import CALMEST, ActionFilter, NoFilter, SafetyFilter, SelectionRates
 from sb3_esad.common.type_aliases import Belief
 
 
@@ -30,7 +30,7 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
     :param barrier_coef: weight of a violated barrier condition; 0 drops it
     :param filter_start: updates after which an action that is not admissible is replaced; None for never
     :param n_candidates: latents of which the worst decide whether an action is admissible
-    :param n_proposals: actions to choose from where the actor's own is not admissible
+    :param n_proposals: samples of the actor, and as many uniform actions, to choose from where its own is not admissible
     :param kwargs: see :class:`CostLimitedAlgorithm` and :class:`LatentAlgorithm`
     :raises ValueError: if an argument is out of its range
     """
@@ -70,8 +70,7 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
         start = self.filter_start
         require(start is None or start >= 0, "filter_start", start, "a number of updates >= 0, or None for no filter")
         require(self.n_candidates >= 1, "n_candidates", self.n_candidates, "a number of latents >= 1")
-        fewest = BEST_UNIFORM + 2
-        require(self.n_proposals >= fewest, "n_proposals", self.n_proposals, f"a number of actions >= {fewest}")
+        require(self.n_proposals >= CALMEST, "n_proposals", self.n_proposals, f"a number of actions >= {CALMEST}")
 
     def _setup_model(self) -> None:
         super()._setup_model()

@@ -103,9 +103,24 @@ class MuonWithAdam(th.optim.Optimizer):
         self._read_weights()  # for Muon keeps its momentum where the weights are
         for part, state in zip(self.parts, state_dict["parts"], strict=True):
             part.load_state_dict(state)
+            refuse_misshapen_state(part)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "matrices": self.matrices, "flat": self.flat, "parts": self.parts}
+
+
+def refuse_misshapen_state(optimizer: th.optim.Optimizer) -> None:
+    """
+    Refuse averages that are not of the shape of their parameter: torch's fused kernels would write beyond their end.
+
+    :param optimizer: whose state was loaded
+    :raises ValueError: if a state belongs to no parameter, or has another shape
+    """
+    for parameter, state in optimizer.state.items():
+        for name, value in state.items():
+            shape = th.Size() if name == "step" else getattr(parameter, "shape", None)
+            if isinstance(value, th.Tensor) and value.shape != shape:
+                raise ValueError(f"The state {name!r} has the shape {tuple(value.shape)}: load one of the same networks.")
 
 
 def _is_matrix(parameter: th.nn.Parameter) -> bool:

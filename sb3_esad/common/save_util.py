@@ -47,6 +47,28 @@ def with_suffix(path: str | pathlib.Path, suffix: str) -> pathlib.Path:
     return path if path.suffix else pathlib.Path(f"{path}{suffix}")
 
 
+@contextmanager
+def saved_file(path: Target, algorithm: str) -> Iterator[tuple[Any, str]]:
+    """
+    Open a saved model.
+
+    :param path: file or file-like object, at whose start it is left; SB3's ``.zip`` may be missing
+    :param algorithm: name of the class that shall load it
+    :return: the file at its start, and its name
+    :raises ValueError: if it is missing
+    """
+    if not isinstance(path, str | pathlib.Path):
+        path.seek(0)
+        yield path, str(getattr(path, "name", "the given file object"))
+        path.seek(0)
+        return
+    found = next((each for each in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if each.is_file()), None)
+    if found is None:
+        raise ValueError(f"There is no file {path}: give the zip that {algorithm}.save() has written.")
+    with found.open("rb") as file:
+        yield file, str(found)
+
+
 def check_saved_model(path: Target, algorithm: str, marks: tuple[str, ...]) -> None:
     """
     Refuse a file that holds no model of an algorithm.
@@ -56,16 +78,8 @@ def check_saved_model(path: Target, algorithm: str, marks: tuple[str, ...]) -> N
     :param marks: attributes that only models of this kind have all of
     :raises ValueError: if it is missing, no zip, damaged, no model of SB3, or one of another algorithm
     """
-    if not isinstance(path, str | pathlib.Path):
-        path.seek(0)
-        _check_archive(path, getattr(path, "name", "the given file object"), algorithm, marks)
-        path.seek(0)
-        return
-    found = next((each for each in (pathlib.Path(path), pathlib.Path(f"{path}.zip")) if each.is_file()), None)
-    if found is None:
-        raise ValueError(f"There is no file {path}: give the zip that {algorithm}.save() has written.")
-    with found.open("rb") as file:
-        _check_archive(file, str(found), algorithm, marks)
+    with saved_file(path, algorithm) as (file, name):
+        _check_archive(file, name, algorithm, marks)
 
 
 def _check_archive(file: Any, name: str, algorithm: str, marks: tuple[str, ...]) -> None:

@@ -13,8 +13,8 @@ from sb3_esad.common.penalties import Penalty
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.type_aliases import Belief, LatentState, Logs
 
-UNIFORM_PROPOSALS, BEST_UNIFORM = 64, 4
-"""Uniform actions that are judged by the critics alone, and how many of them are proposals."""
+CALMEST = 2
+"""How many samples of the actor and how many uniform actions are imagined where the actor's own action is not admissible."""
 
 
 class Selection(NamedTuple):
@@ -125,7 +125,8 @@ class SafetyFilter(ActionFilter):
     :param foresight: imagines where an action leads
     :param risk_level: fraction of the worst scenarios that counts
     :param n_candidates: scenarios
-    :param n_proposals: actions to choose from where the actor's own is not admissible
+    :param n_proposals: samples of the actor, and as many uniform actions, that the critics sift where the actor's own action
+        is not admissible
     """
 
     def __init__(
@@ -192,13 +193,14 @@ class SafetyFilter(ActionFilter):
         return proposals[best, th.arange(len(proposed), device=best.device)], helpless
 
     def _proposals(self, agent: LatentAgent, state: LatentState, proposed: th.Tensor) -> th.Tensor:
-        """The proposed action, samples of the actor, and those of many uniform actions that the critics fear least."""
-        n_states, size = proposed.shape
-        grids = agent.world_model.features(state)
-        uniform = 2 * th.rand(UNIFORM_PROPOSALS, n_states, size, device=proposed.device) - 1
-        fears = self.foresight.risk(agent, grids.repeat(UNIFORM_PROPOSALS, 1, 1, 1), uniform.flatten(0, 1))
-        least = fears.view(UNIFORM_PROPOSALS, n_states).topk(BEST_UNIFORM, dim=0, largest=False).indices
-        calm = uniform.gather(0, least[..., None].expand(-1, -1, size))
-        n_samples = self.n_proposals - BEST_UNIFORM - 1
-        samples = agent.actor(grids.repeat(n_samples, 1, 1, 1)).view(n_samples, n_states, size)
-        return th.cat([proposed[None], samples, calm])
+        """The proposed action, and of samples of the actor and of uniform actions those that the critics fear least."""
+        grids, size = agent.world_model.features(state), proposed.shape[1]
+        samples = agent.actor(grids.repeat(self.n_proposals, 1, 1, 1)).unflatten(0, (self.n_proposals, -1))
+        uniform = 2 * th.rand(self.n_proposals, len(proposed), size, device=proposed.device) - 1
+        calmest = [self._calmest(agent, grids, actions, CALMEST) for actions in (samples, uniform)]
+        return th.cat([proposed[None], *calmest])
+
+    def _calmest(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor, n: int) -> th.Tensor:
+        risks = self.foresight.risk(agent, grids.repeat(len(actions), 1, 1, 1), actions.flatten(0, 1))
+        least = risks.view(actions.shape[:2]).topk(n, dim=0, largest=False).indices
+        return actions.gather(0, least[..., None].expand(-1, -1, actions.shape[2]))

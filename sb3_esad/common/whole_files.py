@@ -5,10 +5,14 @@ import pathlib
 from collections.abc import Iterable
 from typing import Any, ClassVar, TypeVar
 
+import torch as th
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from stable_baselines3.common.type_aliases import GymEnv
 
 from sb3_esad.common.cost_buffers import CostBuffer, refuse_other_buffer
+from sb3_esad.common.description import add_description
 from sb3_esad.common.save_util import check_saved_model, whole_file
+from sb3_esad.common.untrusted import load_untrusted
 
 SelfWhole = TypeVar("SelfWhole", bound="WholeFiles")
 
@@ -32,23 +36,50 @@ class WholeFiles(OffPolicyAlgorithm):
         :param exclude: attributes to leave out beside the usual ones
         :param include: attributes to save although they are usually left out
         """
+        content = io.BytesIO()
+        super().save(content, exclude, include)
+        add_description(content, self)
         with whole_file(path, ".zip") as target:
-            super().save(target, exclude, include)
+            if isinstance(target, pathlib.Path):
+                target.write_bytes(content.getbuffer())
+            else:
+                target.write(content.getbuffer())
 
     @classmethod
-    def load(cls: type[SelfWhole], path: str | pathlib.Path | io.BufferedIOBase, *args: Any, **kwargs: Any) -> SelfWhole:
+    def load(
+        cls: type[SelfWhole],
+        path: str | pathlib.Path | io.BufferedIOBase,
+        env: GymEnv | None = None,
+        device: th.device | str = "auto",
+        custom_objects: dict[str, Any] | None = None,
+        print_system_info: bool = False,
+        force_reset: bool = True,
+        trusted: bool = True,
+        **kwargs: Any,
+    ) -> SelfWhole:
         """
-        Load a saved model.
+        Load a saved model; one of unknown origin with ``trusted=False``, for SB3's way runs whatever code is in it.
+
+        Without trust nothing but JSON values and tensors is read. Arguments that have no such form, such as an
+        ``action_noise``, a function as ``learning_rate`` or classes in ``policy_kwargs``, are refused unless they are given in
+        ``custom_objects``; records of the run, such as the latest episodes, begin anew.
 
         :param path: its zip; ``.zip`` may be left out
-        :param args: see SB3's ``BaseAlgorithm.load``
-        :param kwargs: likewise
+        :param env: environment to go on with; None to predict only
+        :param device: where to compute
+        :param custom_objects: take the place of what the file has under their names
+        :param print_system_info: whether to print where it was saved; with trust only
+        :param force_reset: whether to reset the environment first; without trust it always is
+        :param trusted: whether code in the file may be run
+        :param kwargs: attributes to replace
         :return: the model
         :raises ValueError: if the file is missing, damaged, of another version or holds something else
         """
+        if not trusted:
+            return load_untrusted(cls, path, env, device, custom_objects, **kwargs)
         check_saved_model(path, cls.__name__, marks=cls.saved_marks)
         try:
-            return super().load(path, *args, **kwargs)
+            return super().load(path, env, device, custom_objects, print_system_info, force_reset, **kwargs)
         except ValueError:
             raise
         except Exception as error:  # what is read may be anything

@@ -1,15 +1,16 @@
 """Bird's-eye view of the traffic around the ego vehicle, drawn with OpenCV to a fraction of a pixel."""
 
+import math
 from collections.abc import Sequence
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.geometry import Floats, box_corners
+from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lights import StopLines
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.roads import Bools, Markings
+from sb3_esad.envs.roads import Bools, Ints, Markings
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 
@@ -24,6 +25,66 @@ AMBER_GREY = 210  # of the line before an amber light
 DIAL_SPEED, DIAL_GREY = 32.0, 160  # the speed at which the dial is as high as the image [m/s]
 DIAL_SHARE = 1 / 16  # of the image's width, at either edge
 OFF_ROUTE_GREY, ROUTE_GREY, DASH_GREY, LINE_GREY = 40, 80, 160, 220
+_NEXT_CORNER, _LAST_CORNER = np.array([1, 2, 3, 0]), np.array([3, 0, 1, 2])
+OUTLINE = 2  # nothing further outside than this leaves a trace in an image [px]
+
+
+class Ground:
+    """
+    What does not move, as quadrilaterals in the order in which they are drawn, and the circles around them.
+
+    Asphalt comes first, brighter where the route leads, then painted lines, whose first two corners are their ends.
+
+    :param markings: of the road
+    :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
+    """
+
+    def __init__(self, markings: Markings, route: Bools) -> None:
+        surfaces, on_route = markings.with_route_on_top(route)
+        self.corners = np.concatenate([surfaces, markings.lines[:, [0, 1, 1, 0]]])
+        asphalt, paint = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY), np.where(markings.dashed, DASH_GREY, LINE_GREY)
+        self.greys = np.concatenate([asphalt, paint])
+        self.is_line = np.arange(len(self.corners)) >= len(surfaces)
+        self.centres = self.corners.mean(1)
+        offset = self.corners - self.centres[:, None]
+        self.radii = np.hypot(offset[..., 0], offset[..., 1]).max(1)
+
+
+class Frame:
+    """
+    What a :class:`View` sees from one place.
+
+    :param view: size and scale of the image
+    :param origin: the point of view, shape ``(2,)`` [m]
+    :param heading: the direction that points up [rad]
+    """
+
+    def __init__(self, view: "View", origin: Floats, heading: float) -> None:
+        cos, sin = math.cos(heading), math.sin(heading)
+        self._turn = np.array([[-sin, cos], [cos, sin]]) * view.scale
+        self._shift = view.centre - origin @ self._turn
+        self._middle = float(origin[0]) + view.reach * cos, float(origin[1]) + view.reach * sin
+        self._radius = view.radius
+
+    def near(self, centres: Floats, radii: Floats) -> Ints:
+        """
+        Sort out most of what is out of sight.
+
+        :param centres: of circles, shape ``(n, 2)`` [m]
+        :param radii: of these, shape ``(n,)`` [m]
+        :return: indices of all that may have a part in the image
+        """
+        x, y = self._middle
+        return (np.hypot(centres[:, 0] - x, centres[:, 1] - y) <= radii + self._radius).nonzero()[0]
+
+    def pixels(self, points: Floats) -> NDArray[np.int32]:
+        """
+        Pixel coordinates of points of the world.
+
+        :param points: shape ``(..., 2)`` [m]
+        :return: column and row in fixed point, shape ``(..., 2)`` [px / 16]
+        """
+        return np.rint(points.reshape(-1, 2) @ self._turn + self._shift).astype(np.int32).reshape(points.shape)
 
 
 class View:
@@ -36,59 +97,40 @@ class View:
     """
 
     def __init__(self, shape: Sequence[int], metres_per_pixel: Sequence[float], ahead: float) -> None:
-        self.shape = (int(shape[0]), int(shape[1]))
-        self._scale = np.array([1 / metres_per_pixel[1], -1 / metres_per_pixel[0]]) * 2**SUBPIXEL_BITS
-        centre = np.array([self.shape[1] / 2, self.shape[0] * ahead]) - 0.5  # OpenCV counts from the first pixel's centre
-        self._centre = centre * 2**SUBPIXEL_BITS
-        self._limit = np.array([self.shape[1], self.shape[0]]) * 2**SUBPIXEL_BITS
+        rows, columns = self.shape = (int(shape[0]), int(shape[1]))
+        along, across = metres_per_pixel
+        self.scale = np.array([1 / across, -1 / along]) * 2**SUBPIXEL_BITS
+        self.centre = (np.array([columns / 2, rows * ahead]) - 0.5) * 2**SUBPIXEL_BITS  # OpenCV counts from a pixel's centre
+        self.reach = (ahead - 0.5) * rows * along
+        """How far the middle of the image is ahead of the origin [m]."""
+        self.radius = math.hypot((rows / 2 + OUTLINE) * along, (columns / 2 + OUTLINE) * across)
+        """Of the circle around the image [m]."""
+        self._limit = np.array([columns, rows]) * 2**SUBPIXEL_BITS
 
-    def pixels(self, points: Floats, origin: Floats, heading: float) -> NDArray[np.int32]:
+    def draw(
+        self,
+        images: Sequence[Image],
+        shapes: NDArray[np.int32],
+        colours: Sequence[Colour],
+        is_line: Sequence[bool],
+        thickness: int = 1,
+    ) -> None:
         """
-        Pixel coordinates of points of the world.
+        Draw convex quadrilaterals and straight lines, one after the other.
 
-        :param points: shape ``(..., 2)`` [m]
-        :param origin: the point of view, shape ``(2,)`` [m]
-        :param heading: the direction that points up [rad]
-        :return: column and row in fixed point, shape ``(..., 2)`` [px / 16]
+        :param images: the image each is drawn into, shape ``(rows, columns)`` or ``(rows, columns, 3)``
+        :param shapes: pixel coordinates, shape ``(n, 4, 2)`` [px / 16]
+        :param colours: one each
+        :param is_line: whether it is a line between its first two corners
+        :param thickness: of lines [px]
         """
-        cos, sin = np.cos(heading), np.sin(heading)
-        turn = np.array([[-sin, cos], [cos, sin]]).T
-        return np.rint((points - origin) @ turn * self._scale + self._centre).astype(np.int32)
-
-    def visible(self, shapes: NDArray[np.int32]) -> list[int]:
-        """
-        Which shapes may have a part in the image.
-
-        :param shapes: pixel coordinates of n shapes of k points, shape ``(n, k, 2)`` [px / 16]
-        :return: their indices
-        """
-        low, high = shapes.min(1), shapes.max(1)
-        columns, rows = self._limit
-        seen = (high[:, 0] >= 0) & (high[:, 1] >= 0) & (low[:, 0] <= columns) & (low[:, 1] <= rows)
-        return np.flatnonzero(seen).tolist()
-
-    def fill(self, images: Sequence[Image], shapes: NDArray[np.int32], colours: Sequence[Colour]) -> None:
-        """
-        Fill convex polygons.
-
-        :param images: the image each polygon is drawn into, shape ``(rows, columns)`` or ``(rows, columns, 3)``
-        :param shapes: pixel coordinates, shape ``(n, k, 2)`` [px / 16]
-        :param colours: one per polygon
-        """
-        for index in self.visible(shapes):
-            cv2.fillConvexPoly(images[index], shapes[index], colours[index], cv2.LINE_AA, SUBPIXEL_BITS)
-
-    def lines(self, image: Image, segments: NDArray[np.int32], colours: Sequence[Colour], thickness: int = 1) -> None:
-        """
-        Draw straight lines.
-
-        :param image: drawn into
-        :param segments: pixel coordinates, shape ``(n, 2, 2)`` [px / 16]
-        :param colours: one per line
-        :param thickness: [px]
-        """
-        for index in self.visible(segments):
-            cv2.polylines(image, [segments[index]], False, colours[index], thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+        seen = ((shapes >= 0).any(1) & (shapes <= self._limit).any(1)).all(1)  # OpenCV would do this more slowly
+        for index in seen.nonzero()[0].tolist():
+            image, shape, colour = images[index], shapes[index], colours[index]
+            if is_line[index]:
+                cv2.polylines(image, [shape[:2]], False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+            else:
+                cv2.fillConvexPoly(image, shape, colour, cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -98,23 +140,23 @@ def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
     :param shapes: pixel coordinates of their corners in order, shape ``(n, 4, 2)`` [px / 16]
     :return: the same, smaller
     """
-    sides = shapes[:, [1, 2, 3, 0]] - shapes
+    sides = shapes[:, _NEXT_CORNER] - shapes
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1.0)
     steps = BLEED / lengths[..., None] * sides
-    return np.rint(shapes + steps - steps[:, [3, 0, 1, 2]]).astype(np.int32)
+    return np.rint(shapes + steps - steps[:, _LAST_CORNER]).astype(np.int32)
 
 
-def user_greys(traffic: Traffic) -> list[int]:
+def user_greys(traffic: Traffic) -> Ints:
     """
     Grey levels that tell the speed of vehicles, the ego vehicle's span being the smaller; 255 for what must not be hit.
 
     :param traffic: all road users
-    :return: one grey level per user; never 0, which means that nobody is there
+    :return: one grey level per user, never 0, which means that nobody is there, shape ``(n,)``
     """
     share = np.minimum(traffic.speed / TOP_SPEED, 1.0)
-    grey = np.where(traffic.kind == Kind.VEHICLE, STANDING_GREY + USER_SPAN * share, OBSTACLE_GREY)
+    grey = np.where(traffic.is_vehicle, STANDING_GREY + USER_SPAN * share, OBSTACLE_GREY)
     grey[EGO] = STANDING_GREY + EGO_SPAN * share[EGO]
-    return np.rint(grey).astype(int).tolist()
+    return np.rint(grey).astype(np.int64)
 
 
 def draw_dial(image: Image, speed: float) -> None:
@@ -127,10 +169,12 @@ def draw_dial(image: Image, speed: float) -> None:
     :param image: drawn into, shape ``(rows, columns)``
     :param speed: [m/s]
     """
-    height = min(speed / DIAL_SPEED, 1.0) * image.shape[0]
-    filled = np.clip(height - np.arange(image.shape[0])[::-1], 0.0, 1.0)
-    width = max(1, round(DIAL_SHARE * image.shape[1]))
-    image[:, :width] = image[:, -width:] = np.rint(DIAL_GREY * filled).astype(np.uint8)[:, None]
+    rows, width = image.shape[0], max(1, round(DIAL_SHARE * image.shape[1]))
+    height = min(speed / DIAL_SPEED, 1.0) * rows
+    whole = int(height)
+    dial = np.zeros(rows + 1, dtype=np.uint8)  # one more, above the image, for the fraction of a pixel on top of a full dial
+    dial[rows + 1 - whole :], dial[rows - whole] = DIAL_GREY, round(DIAL_GREY * (height - whole))
+    image[:, :width] = image[:, -width:] = dial[1:, None]
 
 
 class BirdsEyeView:
@@ -147,33 +191,28 @@ class BirdsEyeView:
     def __init__(self, view: View) -> None:
         self.view = view
 
-    def draw(self, markings: Markings, route: Bools, traffic: Traffic, stop_lines: StopLines, heading: float) -> Image:
+    def draw(self, ground: Ground, traffic: Traffic, stop_lines: StopLines, heading: float) -> Image:
         """
         Draw the surroundings of the ego vehicle.
 
-        :param markings: of the road
-        :param route: whether each lane belongs to the ego vehicle's route, shape ``(lanes,)``
+        :param ground: the road
         :param traffic: all road users
         :param stop_lines: before lights that are not green
         :param heading: the direction that points up [rad]
         :return: the image, shape ``(3, rows, columns)``
         """
-        view, origin = self.view, traffic.position[EGO]
-        image = np.zeros((3, *view.shape), dtype=np.uint8)
+        frame = Frame(self.view, traffic.position[EGO], heading)
+        image = np.zeros((3, *self.view.shape), dtype=np.uint8)
         road, users, obstacles = image
-        corners = box_corners(traffic.position, traffic.heading, traffic.size)
-        moves = traffic.kind == Kind.VEHICLE
-        moves[EGO] = False
-        surfaces, on_route = markings.with_route_on_top(route)
-        asphalt = view.pixels(surfaces, origin, heading)
-        boxes = inset(view.pixels(np.concatenate([stop_lines.corners, corners]), origin, heading))
-        layers = (
-            [road] * len(asphalt) + [obstacles] * len(stop_lines.red) + [users if moving else obstacles for moving in moves]
-        )
-        greys = np.where(on_route, ROUTE_GREY, OFF_ROUTE_GREY).tolist()
-        greys += np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY).tolist() + user_greys(traffic)
-        view.fill(layers, np.concatenate([asphalt, boxes]), greys)
-        paint = np.where(markings.dashed, DASH_GREY, LINE_GREY).tolist()
-        view.lines(road, view.pixels(markings.lines, origin, heading), paint)
+        still, rows = frame.near(ground.centres, ground.radii), frame.near(traffic.position, traffic.radius)
+        moves = traffic.is_vehicle[rows] & (rows != EGO)
+        layers = [road] * len(still) + [obstacles] * len(stop_lines.red)
+        layers += [users if moving else obstacles for moving in moves.tolist()]
+        shapes = frame.pixels(np.concatenate([ground.corners[still], stop_lines.corners, traffic.corners[rows]]))
+        shapes[len(still) :] = inset(shapes[len(still) :])
+        lights = np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY)
+        greys = np.concatenate([ground.greys[still], lights, user_greys(traffic)[rows]])
+        is_line = ground.is_line[still].tolist() + [False] * (len(layers) - len(still))
+        self.view.draw(layers, shapes, greys.tolist(), is_line)
         draw_dial(obstacles, float(traffic.speed[EGO]))
         return image

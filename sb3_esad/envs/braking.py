@@ -79,18 +79,17 @@ class Braking(StraightDrive):
 
     def _car_ahead(self) -> int:
         front = int(self.traffic.front[EGO])
-        near = front in self.traffic.drivers and self._distance(front) < NEAR
-        return front if near else -1
+        drives = front >= 0 and bool(self.traffic.drives[front])
+        return front if drives and self._distance(front) < NEAR else -1
 
     def _car_beside(self) -> int:
         """A car in a lane beside the ego vehicle's, a little ahead, with nobody between them; -1 if there is none."""
         traffic, lane = self.traffic, self.traffic.lane[EGO]
-        beside = np.isin(traffic.lane, (self.road.left[lane], self.road.right[lane]))
-        beside[traffic.outsiders] = False
+        beside = (traffic.lane == self.road.left[lane]) | (traffic.lane == self.road.right[lane])
         distance = traffic.position[:, 0] - traffic.position[EGO, 0]
         front = self._car_ahead()
         limit = min(CUT_IN_FROM[1], self._distance(front) - CUT_IN_FROM[0] if front >= 0 else np.inf)
-        rows = np.flatnonzero(beside & (distance > CUT_IN_FROM[0]) & (distance < limit))
+        rows = np.flatnonzero(beside & traffic.drives & (distance > CUT_IN_FROM[0]) & (distance < limit))
         return int(self.np_random.choice(rows)) if rows.size else -1
 
     def _distance(self, row: int) -> float:

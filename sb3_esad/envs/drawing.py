@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.bev import View
-from sb3_esad.envs.geometry import box_corners
+from sb3_esad.envs.bev import DASH_GREY, LINE_GREY, OFF_ROUTE_GREY, ROUTE_GREY, Frame, View
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 from sb3_esad.envs.users import Kind
@@ -16,7 +15,8 @@ Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 SIZE, AHEAD, ZOOM = (960, 320), 0.75, 10.0  # [px], share of what is seen, and pixels for each of those of the agent's image
-GRASS, ASPHALT, ROUTE, PAINT = (44, 62, 48), (70, 70, 74), (92, 92, 98), (225, 225, 225)
+GRASS, PAINT = (44, 62, 48), (225, 225, 225)
+GROUND_COLOURS = {OFF_ROUTE_GREY: (70, 70, 74), ROUTE_GREY: (92, 92, 98), DASH_GREY: PAINT, LINE_GREY: PAINT}
 EGO_COLOUR, CRASH_COLOUR, STATIC_COLOUR, PERSON_COLOUR = (64, 220, 110), (235, 60, 50), (240, 150, 40), (240, 90, 200)
 RED, AMBER = (220, 40, 40), (240, 180, 40)
 SLOW_COLOUR, FAST_COLOUR = np.array([60.0, 90.0, 170.0]), np.array([130.0, 200.0, 255.0])
@@ -30,22 +30,18 @@ def draw_scene(scenario: Scenario) -> Image:
     :param scenario: a scenario that was reset
     :return: RGB picture, shape ``(320, 960, 3)``
     """
-    traffic, markings = scenario.traffic, scenario.road.markings
+    traffic, ground, stop_lines = scenario.traffic, scenario.ground, scenario.stop_lines
     scale = scenario.config["metres_per_pixel"][0] / ZOOM
     view = View(SIZE, (scale, scale), AHEAD)
-    origin, heading = traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error
+    frame = Frame(view, traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error)
     canvas = np.empty((*SIZE, 3), dtype=np.uint8)
     canvas[:] = GRASS
-    surfaces, on_route = markings.with_route_on_top(scenario.route.contains)
-    asphalt = [ROUTE if on else ASPHALT for on in on_route]
-    view.fill([canvas] * len(asphalt), view.pixels(surfaces, origin, heading), asphalt)
-    lines = view.pixels(markings.lines, origin, heading)
-    view.lines(canvas, lines, [PAINT] * len(lines), 2)
-    stop_lines = scenario.stop_lines
-    colours = [RED if red else AMBER for red in stop_lines.red]
-    view.fill([canvas] * len(colours), view.pixels(stop_lines.corners, origin, heading), colours)
-    boxes = view.pixels(box_corners(traffic.position, traffic.heading, traffic.size), origin, heading)
-    view.fill([canvas] * len(boxes), boxes, [_colour(scenario, row) for row in range(len(boxes))])
+    shapes = frame.pixels(np.concatenate([ground.corners, stop_lines.corners, traffic.corners]))
+    colours = [GROUND_COLOURS[grey] for grey in ground.greys.tolist()]
+    colours += [RED if red else AMBER for red in stop_lines.red]
+    colours += [_colour(scenario, row) for row in range(len(traffic.corners))]
+    is_line = ground.is_line.tolist() + [False] * (len(shapes) - len(ground.corners))
+    view.draw([canvas] * len(shapes), shapes, colours, is_line, 2)
     picture = np.ascontiguousarray(np.rot90(canvas, -1))
     _write(picture, scenario)
     return picture

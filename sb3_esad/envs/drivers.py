@@ -88,7 +88,7 @@ class ReferenceDriver(CarFollower):
         traffic, wanted = scenario.traffic, super()._acceleration(scenario, lane)
         own_lane = int(traffic.lane[EGO])
         if lane == own_lane and self._must_get_back(traffic, lane):
-            return min(wanted, max(self._following(scenario, int(traffic.towards_path[EGO, lane])), -FALL_BACK))
+            return min(wanted, max(self._following(scenario, int(traffic.paths.towards[EGO, lane])), -FALL_BACK))
         if lane != own_lane and self._is_behind_obstacle(scenario):  # to follow the obstacle would be to stay
             return max(wanted, min(CREEP_SPEED - float(traffic.speed[EGO]), self._following(scenario, lane)))
         return wanted
@@ -112,7 +112,7 @@ class ReferenceDriver(CarFollower):
     def _best_lane(scenario: Scenario, lane: int) -> int:
         road, traffic, route = scenario.road, scenario.traffic, scenario.route
         if ReferenceDriver._must_get_back(traffic, lane):
-            back = int(traffic.towards_path[EGO, lane])
+            back = int(traffic.paths.towards[EGO, lane])
             return back if traffic.change_is_safe(_SELF, np.array([back]))[0] else lane
         beside = [int(each) for each in (road.left[lane], road.right[lane]) if each != NO_LANE and route.contains[each]]
         beside = [each for each in beside if not ReferenceDriver._must_get_back(traffic, each)]

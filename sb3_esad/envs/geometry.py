@@ -1,22 +1,71 @@
 """Oriented boxes: their corners and whether they overlap. x points forward, y to the right, angles turn from x to y."""
 
+from typing import TypeVar
+
 import numpy as np
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
+AnyFloat = TypeVar("AnyFloat", float, Floats)
 
-_UNIT_CORNERS = np.array([[0.5, -0.5], [0.5, 0.5], [-0.5, 0.5], [-0.5, -0.5]])
+_UNIT_CORNERS = np.array([[0.5, 0.5, -0.5, -0.5], [-0.5, 0.5, 0.5, -0.5]])[..., None]
 
 
-def wrap_angle(angle: Floats) -> Floats:
+def wrap_angle(angle: AnyFloat) -> AnyFloat:
     """
     Bring angles into [-pi, pi).
 
-    :param angle: angles of any shape [rad]
+    :param angle: a number, or an array of any shape [rad]
     :return: the same directions, in [-pi, pi)
     """
     turned = angle + np.pi
     return turned - 2 * np.pi * np.floor(turned / (2 * np.pi)) - np.pi  # several times faster than %
+
+
+def bounded(value: Floats, limit: float) -> Floats:
+    """
+    Keep values within plus and minus a limit; several times faster than ``np.clip`` on short arrays.
+
+    :param value: any shape
+    :param limit: at least 0
+    :return: the same values, those beyond the limit replaced by it
+    """
+    return np.minimum(np.maximum(value, -limit), limit)
+
+
+def directions(heading: Floats) -> Floats:
+    """
+    Unit vectors.
+
+    :param heading: shape ``(n,)`` [rad]
+    :return: shape ``(n, 2)``
+    """
+    return np.array([np.cos(heading), np.sin(heading)]).T.copy()
+
+
+def outlines(size: Floats) -> Floats:
+    """
+    Corners of boxes in their own frames: front left, front right, rear right, rear left.
+
+    :param size: length and width, shape ``(n, 2)`` [m]
+    :return: how far ahead of the centre they are and how far to the right, shape ``(2, 4, n)`` [m]
+    """
+    return _UNIT_CORNERS * size.T[:, None]
+
+
+def placed(outline: Floats, position: Floats, direction: Floats) -> Floats:
+    """
+    Place boxes in the world.
+
+    :param outline: from :func:`outlines`, shape ``(2, 4, n)`` [m]
+    :param position: centres, shape ``(n, 2)`` [m]
+    :param direction: of the long side, unit vectors, shape ``(n, 2)``
+    :return: corners, shape ``(n, 4, 2)`` [m]
+    """
+    x, y = position.T
+    cos_sin = direction.T[:, None]
+    (ahead_cos, right_sin), (ahead_sin, right_cos) = outline * cos_sin, outline * cos_sin[::-1]
+    return np.array([x + ahead_cos - right_sin, y + ahead_sin + right_cos]).transpose(2, 1, 0)
 
 
 def box_corners(position: Floats, heading: Floats, size: Floats) -> Floats:
@@ -28,12 +77,7 @@ def box_corners(position: Floats, heading: Floats, size: Floats) -> Floats:
     :param size: length and width, shape ``(n, 2)`` [m]
     :return: corners, shape ``(n, 4, 2)`` [m]
     """
-    local = _UNIT_CORNERS * size[:, None, :]
-    cos, sin = np.cos(heading)[:, None], np.sin(heading)[:, None]
-    corners = np.empty_like(local)
-    corners[..., 0] = position[:, None, 0] + local[..., 0] * cos - local[..., 1] * sin
-    corners[..., 1] = position[:, None, 1] + local[..., 0] * sin + local[..., 1] * cos
-    return corners
+    return placed(outlines(size), position, directions(heading))
 
 
 def boxes_overlap(box: Floats, others: Floats) -> NDArray[np.bool_]:
@@ -44,13 +88,11 @@ def boxes_overlap(box: Floats, others: Floats) -> NDArray[np.bool_]:
     :param others: corners of the others, shape ``(n, 4, 2)`` [m]
     :return: one truth value per other rectangle, shape ``(n,)``; touching counts as overlap
     """
-    own = np.broadcast_to(box, others.shape)
-    sides = (own[:, 1] - own[:, 0], own[:, 2] - own[:, 1], others[:, 1] - others[:, 0], others[:, 2] - others[:, 1])
-    axes = np.stack(sides, 1)
-    first = np.einsum("nad,ncd->nac", axes, own)
-    second = np.einsum("nad,ncd->nac", axes, others)
-    gaps = (first.min(-1) > second.max(-1)) | (second.min(-1) > first.max(-1))
-    return np.asarray(~gaps.any(-1))
+    pairs = np.empty((2, *others.shape))
+    pairs[0], pairs[1] = box, others
+    sides = pairs[:, :, 1:3] - pairs[:, :, :2]
+    spans = np.concatenate([sides[0], sides[1]], axis=1) @ pairs.swapaxes(2, 3)  # of either box along each of four axes
+    return np.asarray(~(spans.min(-1) > spans.max(-1)[::-1]).any((0, 2)))
 
 
 def box_distances(box: Floats, others: Floats) -> Floats:

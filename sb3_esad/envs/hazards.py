@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats, box_corners, box_distances, boxes_overlap
+from sb3_esad.envs.geometry import Floats, box_distances, boxes_overlap
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Ints, Road
 from sb3_esad.envs.traffic import Traffic
@@ -19,26 +19,10 @@ def users_hit(traffic: Traffic) -> Ints:
     :param traffic: all road users
     :return: their rows
     """
-    reach = traffic.radius + traffic.radius[EGO]
-    offset = np.abs(traffic.position - traffic.position[EGO])
-    rows = np.flatnonzero((offset[:, 0] <= reach) & (offset[:, 1] <= reach))  # the ego vehicle comes first
-    if rows.size == 1:
-        return rows[1:]
-    corners = box_corners(traffic.position[rows], traffic.heading[rows], traffic.size[rows])
-    return rows[1:][boxes_overlap(corners[0], corners[1:])]
-
-
-def is_off_road(road: Road, traffic: Traffic) -> bool:
-    """
-    Whether a corner of the ego vehicle is past the edge of the asphalt.
-
-    :param road: the lanes
-    :param traffic: all road users
-    :return: True if it is
-    """
-    own = slice(EGO, EGO + 1)
-    corners = box_corners(traffic.position[own], traffic.heading[own], traffic.size[own])[0]
-    return not bool(road.contains(corners).all())
+    x, y = (traffic.position - traffic.position[EGO]).T
+    near = np.hypot(x, y) <= traffic.radius + traffic.radius[EGO]
+    rows = near.nonzero()[0][1:]  # the ego vehicle comes first
+    return rows[boxes_overlap(traffic.corners[EGO], traffic.corners[rows])] if rows.size else rows
 
 
 def clearance(road: Road, traffic: Traffic) -> float:
@@ -49,17 +33,15 @@ def clearance(road: Road, traffic: Traffic) -> float:
     :param traffic: all road users
     :return: at most 5 m, negative past the edge [m]
     """
-    corners = box_corners(traffic.position[:1], traffic.heading[:1], traffic.size[:1])[0]
     lane = int(traffic.lane[EGO])
-    _, across = road.project(corners)
+    _, across = road.project(traffic.corners[EGO])
     room = min(NEARBY, *(side for corner in across.T for side in road.room(lane, corner)))
     reach = traffic.radius + traffic.radius[EGO] + NEARBY
     offset = np.abs(traffic.position - traffic.position[EGO])
     rows = np.flatnonzero((offset < reach[:, None]).all(1))[1:]
     if rows.size == 0:
         return room
-    others = box_corners(traffic.position[rows], traffic.heading[rows], traffic.size[rows])
-    return min(room, float(box_distances(corners, others).min()))
+    return min(room, float(box_distances(traffic.corners[EGO], traffic.corners[rows]).min()))
 
 
 class Bodies(NamedTuple):
@@ -89,13 +71,12 @@ def time_to_collision(traffic: Traffic | Bodies) -> float:
     :param traffic: all road users
     :return: infinite if nothing in the path is being approached [s]
     """
-    offset = traffic.position - traffic.position[EGO]
-    cos, sin = traffic.direction[EGO]
-    ahead = offset[:, 0] * cos + offset[:, 1] * sin
-    across = offset[:, 1] * cos - offset[:, 0] * sin
+    (x, y), (cos, sin) = (traffic.position - traffic.position[EGO]).T, traffic.direction[EGO]
+    ahead, across = x * cos + y * sin, y * cos - x * sin
     closing = traffic.speed[EGO] - traffic.velocity @ traffic.direction[EGO]
-    in_path = (np.abs(across) < (traffic.size[:, 1] + traffic.size[EGO, 1]) / 2) & (ahead > 0) & (closing > 0)
-    if not in_path.any():
+    beside = (traffic.size[:, 1] + traffic.size[EGO, 1]) / 2
+    rows = ((np.abs(across) < beside) & (ahead > 0) & (closing > 0)).nonzero()[0]
+    if not rows.size:
         return np.inf
-    gap = ahead - (traffic.size[:, 0] + traffic.size[EGO, 0]) / 2
-    return float((np.maximum(gap[in_path], 0.0) / closing[in_path]).min())
+    gap = ahead[rows] - (traffic.size[rows, 0] + traffic.size[EGO, 0]) / 2
+    return float((np.maximum(gap, 0.0) / closing[rows]).min())

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_esad.envs.bev import BirdsEyeView, View
+from sb3_esad.envs.bev import BirdsEyeView, Ground, View
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.lanes import LANE_WIDTH
 from sb3_esad.envs.lights import StopLines
@@ -26,6 +26,7 @@ class Scene(Protocol):
 
     road: Road
     route: Route
+    ground: Ground
     traffic: Traffic
 
     @property
@@ -72,7 +73,7 @@ class ImageObservation:
         """See :meth:`Observation.observe`."""
         traffic = scene.traffic
         heading = traffic.heading[EGO] - (scene.heading_error if self._frame == "lane" else 0.0)
-        return self._bev.draw(scene.road.markings, scene.route.contains, traffic, scene.stop_lines, heading)
+        return self._bev.draw(scene.ground, traffic, scene.stop_lines, heading)
 
 
 class EgoObservation:

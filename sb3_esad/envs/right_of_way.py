@@ -6,7 +6,8 @@ import numpy as np
 
 from sb3_esad.envs.lanes import NO_LANE
 from sb3_esad.envs.networks import Way
-from sb3_esad.envs.road_users import EGO, LOOKAHEAD
+from sb3_esad.envs.paths import LOOKAHEAD
+from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Bools, Road
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
@@ -90,7 +91,7 @@ class RightOfWay:
             distance += float(traffic.road.length[lane])
             if distance > self._zone:
                 return None
-            lane = int(traffic.next_lane[row, lane])
+            lane = int(traffic.paths.next_lane[row, lane])
             if lane == NO_LANE:
                 return None
         return None

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from sb3_esad.envs.geometry import Floats, wrap_angle
+from sb3_esad.envs.geometry import Floats, directions, wrap_angle
 from sb3_esad.envs.lanes import NO_LANE, Lane
 
 Ints = NDArray[np.int64]
@@ -59,8 +59,9 @@ class Road:
         self.heading = np.array([lane.heading for lane in lanes], dtype=np.float64)
         self.length = np.array([lane.length for lane in lanes], dtype=np.float64)
         self.curvature = np.array([lane.curvature for lane in lanes], dtype=np.float64)
-        self.direction = np.stack([np.cos(self.heading), np.sin(self.heading)], -1)
+        self._origin, self._along = self.start.T[:, :, None].copy(), directions(self.heading).T[:, :, None]
         self.width = np.array([lane.width for lane in lanes])
+        self._half_width = self.width[:, None] / 2
         self.speed_limit = np.array([lane.speed_limit for lane in lanes])
         self.left = np.array([lane.left for lane in lanes])
         self.right = np.array([lane.right for lane in lanes])
@@ -86,10 +87,9 @@ class Road:
         :param position: points, shape ``(n, 2)`` [m]
         :return: distance along the lane from its start, and to the right of its centre, each ``(lanes, n)`` [m]
         """
-        x = position[:, 0] - self.start[:, :1]
-        y = position[:, 1] - self.start[:, 1:]
-        cos, sin = self.direction[:, :1], self.direction[:, 1:]
-        along, across = x * cos + y * sin, y * cos - x * sin
+        offset = position.T[:, None] - self._origin
+        (x_cos, y_sin), (y_cos, x_sin) = offset * self._along, offset[::-1] * self._along
+        along, across = x_cos + y_sin, y_cos - x_sin
         if self.arcs.size:
             along[self.arcs], across[self.arcs] = self._project_onto_arcs(position)
         return along, across
@@ -128,7 +128,7 @@ class Road:
         :param along: distance along each lane, shape ``(lanes, n)`` [m]
         :return: 0 within the lane, shape ``(lanes, n)`` [m]
         """
-        return np.maximum(along - self.length[:, None], 0.0) + np.maximum(-along, 0.0)
+        return np.maximum(np.maximum(along - self.length[:, None], -along), 0.0)
 
     def with_lanes_beside(self, lanes: Iterable[int]) -> set[int]:
         """
@@ -180,29 +180,30 @@ class Road:
             row.append(int(beside[row[-1]]))
         return row
 
-    def closest_lane(self, along: Floats, across: Floats, heading: Floats, handicap: Floats) -> Ints:
+    def closest_lane(self, along: Floats, distance: Floats, heading: Floats, handicap: Floats) -> Ints:
         """
         Lane each point is on, by distance plus difference in heading (as highway-env does).
 
         :param along: from :meth:`project`, shape ``(lanes, n)`` [m]
-        :param across: from :meth:`project`, shape ``(lanes, n)`` [m]
+        :param distance: from each lane, shape ``(lanes, n)`` [m]
         :param heading: of the users, shape ``(n,)`` [rad]
         :param handicap: added to the distance, shape ``(lanes, n)`` [m]
         :return: lane indices, shape ``(n,)``
         """
-        turn = np.abs(wrap_angle(heading - self.heading[:, None] - self.curvature[:, None] * along))
-        return np.asarray(np.argmin(np.abs(across) + self.overshoot(along) + turn + handicap, axis=0))
+        turn = heading - self.heading[:, None]
+        if self.arcs.size:
+            turn -= self.curvature[:, None] * along
+        return np.asarray((distance + np.abs(wrap_angle(turn)) + handicap).argmin(0))
 
-    def contains(self, position: Floats) -> Bools:
+    def covers(self, aside: Floats, overshoot: Floats) -> Bools:
         """
         Whether points lie on any lane's surface.
 
-        :param position: points, shape ``(n, 2)`` [m]
+        :param aside: distance from the centre of each lane, shape ``(lanes, n)`` [m]
+        :param overshoot: from :meth:`overshoot`, shape ``(lanes, n)`` [m]
         :return: truth values, shape ``(n,)``
         """
-        along, across = self.project(position)
-        inside = (np.abs(across) <= self.width[:, None] / 2) & (along >= 0) & (along <= self.length[:, None])
-        return np.asarray(inside.any(0))
+        return np.asarray(((aside <= self._half_width) & (overshoot == 0)).any(0))
 
     def room(self, lane: int, across: Floats) -> tuple[float, float]:
         """

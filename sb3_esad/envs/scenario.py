@@ -9,10 +9,11 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
+from sb3_esad.envs.bev import Ground
 from sb3_esad.envs.config import COMMON, check_config, merge_config
 from sb3_esad.envs.episode import Episode
-from sb3_esad.envs.geometry import wrap_angle
-from sb3_esad.envs.hazards import is_off_road, time_to_collision, users_hit
+from sb3_esad.envs.geometry import bounded, wrap_angle
+from sb3_esad.envs.hazards import time_to_collision, users_hit
 from sb3_esad.envs.lights import NO_LINES, StopLines
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
 from sb3_esad.envs.rewards import DrivingReward
@@ -122,10 +123,9 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
     @property
     def heading_error(self) -> float:
         """Angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
-        traffic = self.traffic
-        lane = traffic.lane[:1]
-        along_lane = self.road.heading_at(lane, traffic.along[lane, EGO])
-        return float(wrap_angle(traffic.heading[EGO] - along_lane)[0])
+        traffic, lane = self.traffic, int(self.traffic.lane[EGO])
+        along_lane = self.road.lanes[lane].heading_at(float(traffic.along[lane, EGO]))
+        return float(wrap_angle(float(traffic.heading[EGO]) - along_lane))
 
     @property
     def stop_lines(self) -> StopLines:
@@ -150,6 +150,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             self.reward.forget()
         self.road = self._make_road()
         self.route = self._make_route()
+        self.ground = Ground(self.road.markings, self.route.contains)
         self.traffic = self._make_traffic()
         self.episode = self._start_episode()
         self.collided = False
@@ -169,7 +170,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         action = np.asarray(action)
         if action.shape != (2,) or not np.isfinite(action).all():
             raise ValueError(f"action {action} is not two finite numbers; give acceleration and steering in [-1, 1]")
-        self._drive(np.clip(action, -1.0, 1.0))
+        self._drive(bounded(action, 1.0))
         terms = self._reward_terms()
         reward = self.reward.total(terms)
         cost_terms = self._cost_terms()
@@ -206,20 +207,18 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             self._check_crash()
             if self.crashed:
                 break
-        on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self._wrong_way()
+        self.wrong_way = abs(self.heading_error) > math.pi / 2
+        on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self.wrong_way
         self.episode.add_motion(duration, metres, self._progress(), on_route)
 
     def _check_crash(self) -> None:
         hit = users_hit(self.traffic)
         self.collided = bool(hit.size)
-        self.off_road = is_off_road(self.road, self.traffic)
+        self.off_road = self.traffic.off_road
         if self.collided:
             self.episode.add_infraction(Kind(self.traffic.kind[hit[0]]).name.lower())
         elif self.off_road:
             self.episode.add_infraction("static")
-
-    def _wrong_way(self) -> bool:
-        return abs(self.heading_error) > math.pi / 2
 
     def _cost_terms(self) -> dict[str, bool]:
         red_light = self._ran_red_light()
@@ -228,7 +227,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return {
             "collision": self.collided,
             "off_road": self.off_road,
-            "wrong_way": self._wrong_way(),
+            "wrong_way": self.wrong_way,
             "red_light": red_light,
         }
 

@@ -5,30 +5,21 @@ from dataclasses import fields
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats, wrap_angle
+from sb3_esad.envs.geometry import Floats, bounded, wrap_angle
 from sb3_esad.envs.lanes import CAR_LENGTH, NO_LANE
-from sb3_esad.envs.road_users import RoadUsers
+from sb3_esad.envs.road_users import RoadUsers, nearest_ahead
 from sb3_esad.envs.roads import Bools, Ints, Road
 from sb3_esad.envs.users import Temper, User
 
 HEADING_GAIN, LATERAL_GAIN = 1 / 0.2, 1 / 0.6  # [1/s]
 MAX_WHEEL_ANGLE, MAX_APPROACH_ANGLE = np.pi / 3, np.pi / 4  # [rad]
 MAX_ACCELERATION = 6.0  # [m/s^2]
+LEAST = 0.01  # nothing is divided by a smaller speed or distance [m/s], [m]
 EASY_BRAKING = 2.0  # cars slow down like this for lanes with a lower limit [m/s^2]
 STOP_GAP, STOP_HEADWAY = CAR_LENGTH / 2 + 1.0, 0.3  # centre to line [m], [s]
 BLIND_BEHIND = 25.0  # nobody changes to a lane this near to its start, where who follows from the lane before is not seen [m]
 GET_BACK = 100.0  # from here on to the end of a lane it is time to be on the lane of one's path [m]
 PURSUIT = 0.1  # cars take the direction that their lane will have after this time [s]
-
-
-def not_zero(value: Floats) -> Floats:
-    """Keep values at least 0.01 away from zero, so that one can divide by them."""
-    return np.copysign(np.maximum(np.abs(value), 0.01), value)
-
-
-def bounded(value: Floats, limit: float) -> Floats:
-    """Keep values within plus and minus a limit; several times faster than ``np.clip`` on short arrays."""
-    return np.minimum(np.maximum(value, -limit), limit)
 
 
 class Traffic(RoadUsers):
@@ -49,9 +40,10 @@ class Traffic(RoadUsers):
         self.temper = {f.name: np.array([getattr(user.temper, f.name) for user in users]) for f in fields(Temper)}
         own = self.temper
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
-        self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking])
+        self._following = (own["acceleration"], own["exponent"], own["gap"], own["headway"], braking)
         self.forced_braking = np.zeros(len(users))  # a scenario makes a car brake this hard, whatever it would do [m/s^2]
         self.stop_distance = np.full(len(users), np.inf)  # to a line before which a car must wait, from its centre [m]
+        self._first_change = np.where(road.continues, BLIND_BEHIND, 0.0)  # from here on one may change to each lane [m]
         super().__init__(road, users)
 
     def _locate(self) -> None:
@@ -60,11 +52,12 @@ class Traffic(RoadUsers):
 
     def _foresee_limits(self) -> Floats:
         """The speed from which each user can still slow down in time for the lanes ahead, shape ``(n,)``."""
-        limits, own = self.road.speed_limit, self.along[self.lane, self._rows]
+        limits = self.road.speed_limit
         limit = limits[self.lane]
-        for going, lanes, passed in self.lanes_ahead(self._rows, self.lane):
-            distance = np.maximum(passed - own[going], 0.0)
-            limit[going] = np.minimum(limit[going], np.sqrt(limits[lanes] ** 2 + 2 * EASY_BRAKING * distance))
+        _, _, rows, further, starts = self.outlook
+        if rows.size:
+            distance = np.maximum(starts - self.along[self.lane[rows], rows], 0.0)
+            np.minimum.at(limit, rows, np.sqrt(limits[further] ** 2 + 2 * EASY_BRAKING * distance))
         return limit
 
     def following_acceleration(self, rows: Ints, front: Ints, judges: Ints) -> Floats:
@@ -76,11 +69,12 @@ class Traffic(RoadUsers):
         :param judges: the users whose temper is applied, shape ``(n,)``
         :return: accelerations, shape ``(n,)`` [m/s^2]
         """
-        acceleration, exponent, gap, headway, braking = self._following[:, judges]
+        acceleration, exponent, gap, headway, braking = (each[judges] for each in self._following)
         speed = self.speed[rows]
-        desired = not_zero(np.minimum(self.target_speed[rows], self.speed_limit[rows]))
-        distance = not_zero(self.distance(rows, front))
-        closing = np.einsum("nd,nd->n", self.velocity[rows] - self.velocity[front], self.direction[rows])
+        desired = np.maximum(np.minimum(self.target_speed[rows], self.speed_limit[rows]), LEAST)
+        distance = np.maximum(np.abs(self.distance(rows, front)), LEAST)
+        (east, south), (cos, sin) = self.velocity.T, self.direction.T
+        closing = (east[rows] - east[front]) * cos[rows] + (south[rows] - south[front]) * sin[rows]
         wanted = gap + speed * headway + speed * closing / braking
         crowding = (front >= 0) * (wanted / distance) ** 2
         return (rows >= 0) * acceleration * (1.0 - (speed / desired) ** exponent - crowding)
@@ -93,9 +87,9 @@ class Traffic(RoadUsers):
         :return: infinite for who need not wait, shape ``(n,)`` [m/s^2]
         """
         distance, speed = self.stop_distance[rows], self.speed[rows]
-        acceleration, _, _, _, braking = self._following[:, rows]
+        acceleration, _, _, _, braking = (each[rows] for each in self._following)
         wanted = STOP_GAP + STOP_HEADWAY * speed + speed**2 / braking
-        free = acceleration * (1.0 - (speed / not_zero(self.target_speed[rows])) ** 4)
+        free = acceleration * (1.0 - (speed / np.maximum(self.target_speed[rows], LEAST)) ** 4)
         stopping = free - acceleration * (wanted / np.maximum(distance, 0.1)) ** 2
         return np.where(distance < np.inf, stopping, np.inf)
 
@@ -120,11 +114,11 @@ class Traffic(RoadUsers):
         :param lanes: the lane each considers, shape ``(n,)``
         :return: one verdict per user, shape ``(n,)``
         """
-        new_front, new_rear = self.neighbours(rows, lanes)
-        old_front, old_rear = self.front[rows], self.rear[rows]
+        front, rear = self.neighbours(np.concatenate([rows, rows]), np.concatenate([lanes, self.lane[rows]]))
+        new_front, old_front, new_rear, old_rear = *front.reshape(2, -1), *rear.reshape(2, -1)
         who = np.concatenate([new_rear, new_rear, rows, rows, old_rear, old_rear])
-        front = np.concatenate([new_front, rows, new_front, old_front, rows, old_front])
-        outcomes = self.following_acceleration(who, front, np.tile(rows, 6)).reshape(6, -1)
+        whom = np.concatenate([new_front, rows, new_front, old_front, rows, old_front])
+        outcomes = self.following_acceleration(who, whom, np.concatenate([rows] * 6)).reshape(6, -1)
         rear_now, rear_then, own_then, own_now, left_now, left_then = outcomes
         others = rear_then - rear_now + left_then - left_now
         advantage = own_then - own_now + self.temper["politeness"][rows] * others
@@ -142,12 +136,12 @@ class Traffic(RoadUsers):
         :param lateral_gain: how fast a lateral offset is corrected [1/s]
         :return: wheel angles, shape ``(n,)`` [rad]
         """
-        speed = not_zero(self.speed[rows])
+        speed = np.maximum(self.speed[rows], LEAST)
         approach = np.arcsin(bounded(-lateral_gain * self.across[lanes, rows] / speed, 1.0))
         ahead = self.road.heading_at(lanes, self.along[lanes, rows] + PURSUIT * self.speed[rows])
         wanted = ahead + bounded(approach, MAX_APPROACH_ANGLE)
         yaw_rate = heading_gain * wrap_angle(wanted - self.heading[rows])
-        slip = np.arcsin(bounded(self.size[rows, 0] / 2 / speed * yaw_rate, 1.0))
+        slip = np.arcsin(bounded(self.half_length[rows] / speed * yaw_rate, 1.0))
         return bounded(np.arctan(2 * np.tan(slip)), MAX_WHEEL_ANGLE)
 
     def act(self) -> None:
@@ -157,23 +151,31 @@ class Traffic(RoadUsers):
         self._choose_lanes(rows)
         target = self.target_lane[rows]
         self.wheel_angle[rows] = self.steering(rows, target)
-        acceleration = self.following_acceleration(rows, self.front[rows], rows)
-        changing = np.flatnonzero(target != self.lane[rows])
-        if changing.size:
-            cars = rows[changing]
-            front, _ = self.neighbours(cars, target[changing])
-            acceleration[changing] = np.minimum(acceleration[changing], self.following_acceleration(cars, front, cars))
-        waiting = np.flatnonzero(self.stop_distance[rows] < np.inf)
+        acceleration = self._follow(rows, target)
+        waiting = (self.stop_distance[rows] < np.inf).nonzero()[0]
         if waiting.size:
             acceleration[waiting] = np.minimum(acceleration[waiting], self.stopping_acceleration(rows[waiting]))
-        forced = self.forced_braking[rows]
-        self.acceleration[rows] = np.where(forced > 0.0, -forced, bounded(acceleration, MAX_ACCELERATION))
+        self.acceleration[rows] = bounded(acceleration, MAX_ACCELERATION)
+        forced = self.forced_braking.nonzero()[0]
+        self.acceleration[forced] = -self.forced_braking[forced]
+
+    def _follow(self, rows: Ints, target: Ints) -> Floats:
+        """Accelerations behind who is ahead in the own lane and, if that is another one, in the target lane, too."""
+        changing = (target != self.lane[rows]).nonzero()[0]
+        if not changing.size:
+            return self.following_acceleration(rows, self.front[rows], rows)
+        cars = rows[changing]
+        front = nearest_ahead(*self.gaps(self.paths.outlook(cars, target[changing])))
+        everyone = np.concatenate([rows, cars])
+        acceleration = self.following_acceleration(everyone, np.concatenate([self.front[rows], front]), everyone)
+        acceleration[changing] = np.minimum(acceleration[changing], acceleration[len(rows) :])
+        return acceleration[: len(rows)]
 
     def _continue_lanes(self, rows: Ints) -> None:
         target = self.target_lane[rows]
-        done = self.along[target, rows] > self.road.length[target] - CAR_LENGTH / 2
-        following = self.next_lane[rows, target]
-        self.target_lane[rows] = np.where(done & (following != NO_LANE), following, target)
+        following = self.paths.next_lane[rows, target]
+        done = (following != NO_LANE) & (self.along[target, rows] > self.road.length[target] - CAR_LENGTH / 2)
+        self.target_lane[rows[done]] = following[done]
 
     def _choose_lanes(self, rows: Ints) -> None:
         before = self.target_lane.copy()
@@ -184,8 +186,8 @@ class Traffic(RoadUsers):
             due = self.must_get_back(pondering, self.lane[pondering])
             self._ponder(pondering[~due])
             self._get_back(pondering[due])
-        for row in rows[changing]:
-            self._reconsider(int(row), before)
+        for row in rows[changing].tolist():
+            self._reconsider(row, before)
 
     def must_get_back(self, rows: Ints, lanes: Ints) -> Bools:
         """
@@ -195,30 +197,33 @@ class Traffic(RoadUsers):
         :param lanes: the lane to judge for each of them, shape ``(n,)``
         :return: one verdict per user, shape ``(n,)``
         """
+        if not self.paths.any_leads_astray:
+            return np.zeros(len(rows), dtype=bool)
         left = self.road.length[lanes] - self.along[lanes, rows]
-        return np.asarray(self.leads_astray[rows, lanes] & (left < GET_BACK))
+        return np.asarray(self.paths.leads_astray[rows, lanes] & (left < GET_BACK))
 
     def _ponder(self, rows: Ints) -> None:
-        cars = np.concatenate([rows, rows])
-        lanes = np.concatenate([self.road.left[self.lane[rows]], self.road.right[self.lane[rows]]])
+        own, cars = self.lane[rows], np.concatenate([rows, rows])
+        lanes = np.concatenate([self.road.left[own], self.road.right[own]])
         possible = (lanes != NO_LANE) & self._can_change(cars, lanes) & ~self.must_get_back(cars, lanes)
         cars, lanes = cars[possible], lanes[possible]
-        worth = self.change_is_worth_it(cars, lanes)
-        self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
+        if cars.size:
+            worth = self.change_is_worth_it(cars, lanes)
+            self.target_lane[cars[worth]] = lanes[worth]  # right comes last and wins, as in highway-env
 
     def _get_back(self, rows: Ints) -> None:
-        lanes = self.towards_path[rows, self.lane[rows]]
-        possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
-        rows, lanes = rows[possible], lanes[possible]
-        safe = self.change_is_safe(rows, lanes)
-        self.target_lane[rows[safe]] = lanes[safe]
+        if rows.size:
+            lanes = self.paths.towards[rows, self.lane[rows]]
+            possible = (lanes != self.lane[rows]) & self._can_change(rows, lanes)
+            rows, lanes = rows[possible], lanes[possible]
+            safe = self.change_is_safe(rows, lanes)
+            self.target_lane[rows[safe]] = lanes[safe]
 
     def _can_change(self, rows: Ints, lanes: Ints) -> Bools:
-        along, across = self.along[lanes, rows], self.across[lanes, rows]
-        reachable = (np.abs(across) <= 2 * self.road.width[lanes]) & (along >= 0)
-        reachable &= along < self.road.length[lanes] + CAR_LENGTH
-        reachable &= (along >= BLIND_BEHIND) | ~self.road.continues[lanes]
-        return np.asarray(reachable & (np.abs(self.speed[rows]) >= 1.0))
+        along = self.along[lanes, rows]
+        reachable = (along >= self._first_change[lanes]) & (along < self.road.length[lanes] + CAR_LENGTH)
+        reachable &= np.abs(self.across[lanes, rows]) <= 2 * self.road.width[lanes]
+        return np.asarray(reachable & (self.speed[rows] >= 1.0))
 
     def _reconsider(self, row: int, before: Ints) -> None:
         """Give up a lane change if someone ahead is changing into the same lane; cars decide in the order of their rows."""
@@ -235,11 +240,13 @@ class Traffic(RoadUsers):
         :param aims: the lane each user steers for, shape ``(n,)``
         :return: True if it had better stay behind
         """
-        rivals = np.flatnonzero((aims == lane) & (self.lane != lane))
+        rivals = ((aims == lane) & (self.lane != lane)).nonzero()[0]
         rivals = rivals[rivals != row]
+        if not rivals.size:
+            return False
         distance = self.distance(np.full_like(rivals, row), rivals)
         closing = (self.velocity[row] - self.velocity[rivals]) @ self.direction[row]
-        _, _, gap, headway, braking = self._following[:, row]
+        _, _, gap, headway, braking = (each[row] for each in self._following)
         wanted = gap + self.speed[row] * headway + self.speed[row] * closing / braking
         return bool(np.any((distance > 0) & (distance < wanted)))
 

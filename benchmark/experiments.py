@@ -1,0 +1,240 @@
+"""
+The experiments of docs/experiments.md by name: ``python benchmark/experiments.py E5 --seeds 0 1 2``.
+
+Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept.
+The table pools the last evaluation of all seeds: driving score with the interval over seeds, the rest over episodes.
+"""
+
+import argparse
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from sb3_esad.envs.intervals import mean_interval, wilson_interval
+
+HIGHWAY, BRAKING = "esad-highway-v0", "esad-braking-v0"
+SITUATIONS = (HIGHWAY, "esad-traffic-negotiation-v0", "esad-obstacle-avoidance-v0", BRAKING)
+
+
+class Arm(NamedTuple):
+    """
+    One side of an experiment.
+
+    :param algorithm: key of ``ALGORITHMS`` in benchmark/driving.py
+    :param changes: arguments of its constructor to replace
+    """
+
+    algorithm: str
+    changes: dict[str, Any]
+
+
+class Experiment(NamedTuple):
+    """
+    A question that trainings answer.
+
+    :param question: in words
+    :param envs: scenarios
+    :param steps: of each training
+    :param arms: by name, the first is what the others are compared with
+    """
+
+    question: str
+    envs: tuple[str, ...]
+    steps: int
+    arms: dict[str, Arm]
+
+
+def diffusion(steps: int) -> dict[str, Any]:
+    """
+    Set the steps of the latent's diffusion.
+
+    :param steps: K
+    :return: arguments of the constructor
+    """
+    return {"policy_kwargs": {"head_kwargs": {"diffusion_steps": steps}}}
+
+
+FILTER = {"filter_start": 500}
+FULL = {**diffusion(2), **FILTER, "barrier_coef": 1.0}
+EXPERIMENTS = {
+    "E3": Experiment(
+        "How fast may the multiplier move?",
+        (HIGHWAY,),
+        15_000,
+        {f"lambda_lr {rate}": Arm("esad_lend", {"lambda_lr": rate}) for rate in (0.01, 0.003, 0.03)},
+    ),
+    "E4": Experiment(
+        "How many steps of diffusion?",
+        (HIGHWAY, "esad-traffic-negotiation-v0"),
+        15_000,
+        {f"K = {steps}": Arm("esad_lend", diffusion(steps)) for steps in (0, 1, 2, 3)},
+    ),
+    "E5": Experiment(
+        "Does the filter prevent collisions, and the barrier?",
+        (HIGHWAY, BRAKING),
+        15_000,
+        {
+            "neither": Arm("esad_lend", {}),
+            "filter": Arm("esad_lend", FILTER),
+            "barrier": Arm("esad_lend", {"barrier_coef": 1.0}),
+            "both": Arm("esad_lend", {**FILTER, "barrier_coef": 1.0}),
+        },
+    ),
+    "E6": Experiment(
+        "How much entropy?",
+        (HIGHWAY,),
+        15_000,
+        {f"target {target}": Arm("esad_lend", {"target_entropy": target}) for target in (-2.0, -1.0, 0.0)},
+    ),
+    "E7": Experiment(
+        "Are recorded costs needed, and more of them than there were?",
+        (HIGHWAY,),
+        15_000,
+        {
+            "both": Arm("esad_lend", {}),
+            "critics from imagination alone": Arm("esad_lend", {"replay_cost_critic_coef": 0.0}),
+            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0}}),
+        },
+    ),
+    "E9": Experiment(
+        "Ahead of algorithms without a model?",
+        (HIGHWAY, BRAKING),
+        20_000,
+        {name: Arm(name, {}) for name in ("esad_lend", "sac", "sac_lag", "wcsac")},
+    ),
+    "ablations": Experiment(
+        "What are diffusion and safety worth?",
+        SITUATIONS,
+        15_000,
+        {
+            "ESAD-LEND": Arm("esad_lend", FULL),
+            "SAD-LEN": Arm("sad_len", {**FILTER, "barrier_coef": 1.0}),
+            "AD-END": Arm("ad_end", {}),
+        },
+    ),
+}
+
+
+class Run(NamedTuple):
+    """
+    One training.
+
+    :param env_id: scenario
+    :param name: of the arm
+    :param arm: what is trained
+    :param seed: of the training
+    :param folder: where it leaves its curve
+    """
+
+    env_id: str
+    name: str
+    arm: Arm
+    seed: int
+    folder: Path
+
+    @property
+    def curve(self) -> Path:
+        """File with a line of JSON for each evaluation."""
+        return self.folder / f"{self.arm.algorithm}_{self.seed}.jsonl"
+
+
+def runs(name: str, seeds: list[int], out: Path) -> Iterator[Run]:
+    """
+    List the trainings of an experiment.
+
+    :param name: key of ``EXPERIMENTS``
+    :param seeds: of the trainings
+    :param out: folder of all results
+    :return: one run for each scenario, arm and seed
+    """
+    for seed in seeds:
+        for env_id in EXPERIMENTS[name].envs:
+            for arm_name, arm in EXPERIMENTS[name].arms.items():
+                yield Run(env_id, arm_name, arm, seed, out / name / env_id / arm_name.replace(" ", "_"))
+
+
+def train(run: Run, steps: int, episodes: int) -> None:
+    """
+    Train and evaluate on a thread of its own, unless that has been done.
+
+    :param run: which
+    :param steps: of the training
+    :param episodes: of each evaluation
+    """
+    if run.curve.exists() and json.loads(run.curve.read_text().splitlines()[-1])["steps"] >= steps:
+        return
+    script = Path(__file__).with_name("driving.py")
+    what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
+    how = ["--steps", str(steps), "--every", "3000", "--episodes", str(episodes), "--threads", "1", "--out", str(run.folder)]
+    print(f"{run.env_id}, {run.name}, seed {run.seed} ...", flush=True)
+    quiet = {"stdout": subprocess.DEVNULL, "env": {**os.environ, "OMP_NUM_THREADS": "1"}}
+    subprocess.run([sys.executable, str(script), *what, *how], check=True, **quiet)  # type: ignore[call-overload]
+
+
+def row(name: str, ends: list[dict[str, Any]]) -> str:
+    """
+    Pool the ends of an arm's seeds.
+
+    :param name: of the arm
+    :param ends: last evaluations
+    :return: a line of the table
+    """
+    cells = []
+    for mode in ("best", "sampled"):
+        scores = np.array([end[mode]["DS"] for end in ends])
+        low, high = mean_interval(scores) if len(scores) > 1 else (ends[0][mode]["DS_low"], ends[0][mode]["DS_high"])
+        n = round(sum(end[mode]["episodes"] for end in ends))
+        free = round(sum(end[mode]["collision_free"] * end[mode]["episodes"] for end in ends))
+        safe = 100 * np.array(wilson_interval(free, n))
+        speed = np.mean([end[mode]["speed"] for end in ends])
+        cells.append(
+            f"{scores.mean():.1f} [{low:.1f}, {high:.1f}], {100 * free / n:.0f} [{safe[0]:.0f}, {safe[1]:.0f}], {speed:.1f}"
+        )
+    costs = ", ".join(f"{end['training_cost']:.0f}" for end in ends)
+    return f"| {name} | {' | '.join(cells)} | {costs} |"
+
+
+def print_table(name: str, seeds: list[int], out: Path) -> None:
+    """
+    Print what has been found so far.
+
+    :param name: key of ``EXPERIMENTS``
+    :param seeds: of the trainings
+    :param out: folder of all results
+    """
+    print(f"{name}: {EXPERIMENTS[name].question}\n")
+    print("| scenario, arm | best: DS, collision-free %, m/s | sampled | training costs |\n|---|---|---|---|")
+    ends: dict[str, list[dict[str, Any]]] = {}
+    for run in runs(name, seeds, out):
+        if run.curve.exists():
+            ends.setdefault(f"{run.env_id}, {run.name}", []).append(json.loads(run.curve.read_text().splitlines()[-1]))
+    for label, lines in ends.items():
+        print(row(label, lines))
+
+
+def main() -> None:
+    """Run an experiment, or print its table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("name", choices=list(EXPERIMENTS))
+    parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
+    parser.add_argument("--steps", type=int, help="instead of the experiment's own")
+    parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--out", type=Path, default=Path("runs"))
+    parser.add_argument("--table", action="store_true", help="print what has been found so far")
+    args = parser.parse_args()
+    if not args.table:
+        steps = args.steps or EXPERIMENTS[args.name].steps
+        with ThreadPoolExecutor(2) as two:
+            list(two.map(lambda run: train(run, steps, args.episodes), runs(args.name, args.seeds, args.out)))
+    print_table(args.name, args.seeds, args.out)
+
+
+if __name__ == "__main__":
+    main()
