@@ -153,3 +153,18 @@ def test_other_groups_and_other_states_are_refused() -> None:
     adam = th.optim.Adam([nn.Parameter(th.ones(3))])
     with pytest.raises(ValueError, match="no state of MuonWithAdam: use the optimizer_class"):
         optimizer.load_state_dict(adam.state_dict())
+
+
+@pytest.mark.parametrize(("part", "index", "name"), [(0, 0, "momentum_buffer"), (1, 0, "exp_avg"), (1, 99, "exp_avg")])
+def test_averages_of_another_shape_are_refused(part: int, index: int, name: str) -> None:
+    """Torch's fused kernel would write beyond their end; what is left is as good as new."""
+    network = small_network()
+    optimizer = MuonWithAdam(network.parameters(), lr=0.01)
+    backward(network)
+    optimizer.step()
+    state = deepcopy(optimizer.state_dict())
+    state["parts"][part]["state"].setdefault(index, {})[name] = th.zeros(1)
+    with pytest.raises(ValueError, match=rf"The state '{name}' has the shape \(1,\): load one of the same networks"):
+        optimizer.load_state_dict(state)
+    optimizer.step()
+    assert all(parameter.isfinite().all() for parameter in network.parameters())

@@ -16,12 +16,13 @@ import torch as th
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from stable_baselines3 import SAC
+from stable_baselines3.common.base_class import BaseAlgorithm
 from stable_baselines3.common.noise import NormalActionNoise
 from stable_baselines3.common.utils import LinearSchedule
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.policies import LatentPolicy
-from sb3_esad.common.whole_files import WholeFiles
+from sb3_esad.wcsac import WCSAC
 from tests.conftest import SPACES, TINY, CountingEnv, actions_of, assert_same, make_env
 from tests.tampering import (
     Bomb,
@@ -44,19 +45,13 @@ from tests.tampering import (
 pytestmark = pytest.mark.usefixtures("nothing_else_happens")
 
 
-class SharedSAC(WholeFiles, SAC):
-    """Another algorithm of SB3 whose models are shared; what it saves differs from ours."""
-
-    saved_mark = "target_update_interval"
-
-
 def train(policy: str = "MlpPolicy", **kwargs: Any) -> ESADLEND:
     return ESADLEND(policy, make_env(policy), **{**TINY, "penalty_warmup": 0, "ent_coef": "auto", **kwargs}).learn(32)
 
 
-def make_sac(**kwargs: Any) -> SharedSAC:
+def make_wcsac(**kwargs: Any) -> WCSAC:
     tiny: dict[str, Any] = {"policy_kwargs": {"net_arch": [4]}, "buffer_size": 100, "learning_starts": 10, "device": "cpu"}
-    return SharedSAC("MlpPolicy", make_env(), **{**tiny, **kwargs})
+    return WCSAC("MlpPolicy", make_env(), **{**tiny, **kwargs})
 
 
 def load(content: bytes, algorithm: Any = ESADLEND, **kwargs: Any) -> Any:
@@ -92,11 +87,12 @@ def test_both_ways_lead_to_the_same_model(policy: str) -> None:
     model = train(policy)
     content = zipped(model)
     mine, theirs = load(content), ESADLEND.load(io.BytesIO(content), device="cpu")
+    stock = BaseAlgorithm.load.__func__(ESADLEND, io.BytesIO(content), device="cpu")  # type: ignore[attr-defined]
     assert_same(mine.get_parameters(), theirs.get_parameters())
-    np.testing.assert_array_equal(actions_of(mine), actions_of(model))
-    np.testing.assert_array_equal(actions_of(theirs), actions_of(model))
+    for loaded in (mine, theirs, stock):
+        np.testing.assert_array_equal(actions_of(loaded), actions_of(model))
     run = {"_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"}
-    built = {"policy", "penalty", "entropy", "replay_buffer", "lr_schedule", "_episode_costs"}
+    built = {"policy", "penalty", "entropy", "replay_buffer", "lr_schedule", "_episode_costs", "_selections"}
     for name in vars(theirs).keys() - run - built:
         assert getattr(mine, name) == getattr(theirs, name), name
 
@@ -200,10 +196,10 @@ def test_attributes_of_the_user_are_refused_by_name() -> None:
 
 @pytest.mark.parametrize("arguments", [{}, {"ent_coef": 0.3}, {"use_sde": True}], ids=str)
 def test_another_algorithm(arguments: dict[str, Any]) -> None:
-    """With variables that are no modules, and a replay buffer of SB3's."""
-    model = make_sac(**arguments).learn(20)
+    """With variables that are no modules, and networks of SB3."""
+    model = make_wcsac(**arguments).learn(20)
     content = zipped(model)
-    loaded = load(content, SharedSAC, env=make_env())
+    loaded = load(content, WCSAC, env=make_env())
     assert_same(loaded.get_parameters(), model.get_parameters())
     (variable,) = model._get_torch_save_params()[1]
     assert th.equal(getattr(loaded, variable), getattr(model, variable))
@@ -222,20 +218,22 @@ def test_the_bombs_are_live(fresh: bytes, tmp_path: Path) -> None:
     assert {path.name for path in tmp_path.iterdir()} == {"data", "tensors"}
 
 
+REBUILT = {"policy_class", "observation_space", "action_space", "train_freq", "replay_buffer_class", "lr_schedule"}
+BEGUN_ANEW = {"_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"}
+COUNTS = {"num_timesteps", "_n_updates", "_total_timesteps", "start_time", "total_cost"}
+
+
+def test_code_that_is_not_looked_at(fresh: bytes, trace: Path) -> None:
+    bombs = {name: pickled(Bomb(trace)) for name in {*REBUILT, *BEGUN_ANEW, *COUNTS, "tensorboard_log"}}
+    np.testing.assert_array_equal(actions_of(load(tamper(fresh, data_with(**bombs)))), actions_of(load(fresh)))
+
+
 def test_code_in_the_data(fresh: bytes, trace: Path) -> None:
-    """What can be rebuilt otherwise is ignored, the rest is refused by its name."""
-    ignored = set()
-    for name in (*json.loads(unpack(fresh)["data"]), "note", "predict", "__class__", "env", "replay_buffer"):
-        content = tamper(fresh, data_with(**{name: pickled(Bomb(trace))}))
-        try:
-            load(content)
-        except ValueError:
-            assert_refused(content, repr(name))
-        else:
-            ignored.add(name)
-    described = {"policy_class", "observation_space", "action_space", "train_freq", "replay_buffer_class", "tensorboard_log"}
-    assert described <= ignored and {"_last_obs", "ep_info_buffer", "lr_schedule", "num_timesteps"} <= ignored
-    assert not ignored & {"gamma", "policy_kwargs", "action_noise", "learning_rate", "note", "predict", "__class__", "env"}
+    """Any other pickle is refused by its name."""
+    arguments = {name for name in json.loads(unpack(fresh)["data"]) if name[0] != "_"} - REBUILT - BEGUN_ANEW - COUNTS
+    assert len(arguments) > 40
+    for name in (*arguments - {"tensorboard_log"}, "note", "predict", "__class__", "env", "replay_buffer"):
+        assert_refused(tamper(fresh, data_with(**{name: pickled(Bomb(trace))})), repr(name))
 
 
 FORMS_OF_CODE: dict[str, Callable[[Any], bytes]] = {
@@ -247,12 +245,12 @@ FORMS_OF_CODE: dict[str, Callable[[Any], bytes]] = {
 
 
 @pytest.mark.parametrize("form", FORMS_OF_CODE)
-def test_code_among_the_tensors(form: str, saved: bytes, trace: Path) -> None:
+def test_code_among_the_tensors(form: str, fresh: bytes, trace: Path) -> None:
     code = FORMS_OF_CODE[form](Bomb(trace))
-    names = [name for name in unpack(saved) if name.endswith(".pth")]
+    names = [name for name in unpack(fresh) if name.endswith(".pth")]
     assert len(names) == 9
     for name in names:
-        assert_refused(tamper(saved, lambda members, name=name: members.update({name: code})), f"'{name}' does not fit")
+        assert_refused(tamper(fresh, member(name, code)), f"'{name}' does not fit")
 
 
 def test_code_in_the_description(fresh: bytes, trace: Path) -> None:
@@ -274,14 +272,15 @@ def box(shape: list[int]) -> dict[str, Any]:
 
 TAMPERINGS: dict[str, tuple[Tampering, str]] = {
     # Names
-    "path traversal": (member("../../evil.pth", b"x"), "'../../evil.pth' is none of a saved ESADLEND"),
+    "path traversal": (member("../../evil.pth", torch_file({})), "'../../evil.pth' is none of a saved ESADLEND"),
     "absolute path": (member("/etc/evil", b"x"), "'/etc/evil' is none"),
-    "backslashes": (member("..\\evil.pth", b"x"), "is none"),
+    "backslashes": (member("..\\evil.pth", torch_file({})), "is none"),
     "attributes of attributes": (member("policy.predict.__func__.__globals__.pth", torch_file({})), "is none"),
     "another network": (member("policy.actor.pth", torch_file({})), "'policy.actor.pth' is none"),
     "a folder": (member("policy/", b""), "'policy/' is none"),
     "an executable": (member("run_me.py", b"1/0"), "'run_me.py' is none"),
-    "terminal codes": (member("\x1b[2J\n.pth", b"x"), "is none"),
+    "terminal codes": (member("\x1b[2J\n.pth", torch_file({})), "is none"),
+    "terminal codes, and no tensors": (member("\x1b[2J\n.pth", b"x"), "does not fit"),
     "variables of the class": (
         member("pytorch_variables.pth", torch_file({"__class__": th.zeros(1)})),
         "['__class__'] instead of []",
@@ -289,8 +288,8 @@ TAMPERINGS: dict[str, tuple[Tampering, str]] = {
     # Missing
     "no data": (without("data"), "no member 'data'"),
     "no description": (without("sb3_esad.json"), "no member 'sb3_esad.json'"),
-    "no policy": (without("policy.pth"), "no member 'policy.pth'"),
-    "no penalty": (without("penalty.pth"), "no member 'penalty.pth'"),
+    "no policy": (without("policy.pth"), "larger networks than its member 'policy.pth' has"),
+    "no penalty": (without("penalty.pth"), "'penalty.pth' is missing"),
     "no spaces": (described(settings={}), "'policy_class' is pickled"),
     # Not what they should be
     "data is a list": (member("data", b"[]"), "'data' holds [] instead of a JSON object"),
@@ -323,7 +322,7 @@ TAMPERINGS: dict[str, tuple[Tampering, str]] = {
     "arguments of the buffer": (data_with(replay_buffer_kwargs={"device": "cuda"}), "no model can be made of it"),
     "a pickle within a pickle": (policy_kwargs(**{":serialized:": "gASV"}), "'policy_kwargs' is pickled"),
     "a buffer as policy": (setting("policy_class", {"class": "SequenceReplayBuffer"}), "no model can be made of it"),
-    "a policy as buffer": (setting("replay_buffer_class", {"class": "MlpPolicy"}), "replay_buffer_class is 'LatentPolicy'"),
+    "a policy as buffer": (setting("replay_buffer_class", {"class": "MlpPolicy"}), "replay_buffer_class is 'MlpPolicy'"),
     "no actions": (setting("action_space", {"Dict": {}}), "no model can be made of it"),
     # Absurd numbers
     "steps": (data_with(buffer_size=10**13), "MemoryError"),
@@ -342,27 +341,44 @@ TAMPERINGS: dict[str, tuple[Tampering, str]] = {
     "choices": (setting("observation_space", {"Discrete": {"n": 10**15, "start": 0, "dtype": "int64"}}), ""),
     "switches": (setting("observation_space", {"MultiBinary": {"n": 10**12}}), ""),
     "a longer window": (data_with(sequence_length=10**12), "sequence_length is 1000000000000"),
+    "candidates": (data_with(n_candidates=10**9), "n_candidates is 1000000000"),
+    "steps to look ahead": (data_with(barrier_steps=10**9), "barrier_steps is 1000000000"),
+    "proposals": (data_with(n_proposals=10**9), "n_proposals is 1000000000"),
+    "steps of diffusion": (policy_kwargs(head_kwargs={"diffusion_steps": 10**9}), "diffusion_steps is 1000000000"),
     "another seed": (data_with(seed=-1), ""),
     # Tensors
-    "no tensors": (member("policy.pth", torch_file(5)), "'policy.pth' does not fit"),
-    "other networks": (member("policy.pth", torch_file({"a": th.zeros(3)})), "'policy.pth' does not fit"),
+    "no tensors": (member("penalty.pth", torch_file(5)), "'penalty.pth' does not fit"),
+    "other networks": (member("policy.pth", torch_file({"a": th.zeros(10**6)})), "'policy.pth' does not fit"),
+    "smaller networks": (
+        member("policy.pth", torch_file({"a": th.zeros(3)})),
+        "larger networks than its member 'policy.pth' has",
+    ),
     "another penalty": (member("penalty.pth", torch_file({"multiplier": th.zeros(5)})), "'penalty.pth' does not fit"),
     "an empty file": (member("entropy.pth", b""), "'entropy.pth' does not fit: it is cut off or damaged"),
     "half a file": (
         lambda members: members.update({"policy.pth": members["policy.pth"][:5000]}),
         "'policy.pth' does not fit: it is",
     ),
-    "a script": (
-        member("policy.pth", pack({**unpack(torch_file({})), "archive/constants.pkl": b"."})),
-        "'policy.pth' does not fit",
-    ),
 }
 
 
+@pytest.mark.parametrize("name", ["policy.actor.optimizer.pth", "entropy.optimizer.pth"])
+def test_averages_of_another_shape(name: str, saved: bytes) -> None:
+    """Fused kernels of torch would write beyond the end of them."""
+
+    def shorten(state: Any) -> Any:
+        if isinstance(state, dict):
+            return {key: th.zeros(0) if key == "exp_avg" else shorten(each) for key, each in state.items()}
+        return [shorten(each) for each in state] if isinstance(state, list) else state
+
+    state = th.load(io.BytesIO(unpack(saved)[name]), weights_only=True)
+    assert_refused(tamper(saved, member(name, torch_file(shorten(state)))), f"'{name}' does not fit: The state 'exp_avg'")
+
+
 @pytest.mark.parametrize("name", TAMPERINGS)
-def test_tampered(name: str, saved: bytes) -> None:
+def test_tampered(name: str, fresh: bytes) -> None:
     tampering, words = TAMPERINGS[name]
-    assert_refused(tamper(saved, tampering), words)
+    assert_refused(tamper(fresh, tampering), words)
 
 
 # Zips that are not what they seem
@@ -417,21 +433,21 @@ ZIPS: dict[str, tuple[Callable[[bytes], bytes], str]] = {
         lambda content: tamper(content, member("data2", b"{}")).replace(b"data2", b"data\0"),
         "two members 'data'",
     ),
-    "another algorithm": (lambda content: zipped(make_sac()), "holds a model of 'SharedSAC'"),
+    "another algorithm": (lambda content: zipped(make_wcsac()), "holds a model of 'WCSAC'"),
     "SB3's own": (lambda content: zipped(SAC("MlpPolicy", make_env(), buffer_size=10)), "no member 'sb3_esad.json'"),
 }
 
 
 @pytest.mark.filterwarnings("ignore:Duplicate name:UserWarning")
 @pytest.mark.parametrize("name", ZIPS)
-def test_zips_that_are_not_what_they_seem(name: str, saved: bytes) -> None:
+def test_zips_that_are_not_what_they_seem(name: str, fresh: bytes) -> None:
     change, words = ZIPS[name]
-    assert_refused(change(saved), words)
+    assert_refused(change(fresh), words)
 
 
-def test_files_of_any_size_are_not_read(saved: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("sb3_esad.common.untrusted.LARGEST_FILE", len(saved) - 1)
-    assert_refused(saved, "it has more than")
+def test_files_of_any_size_are_not_read(fresh: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("sb3_esad.common.untrusted.LARGEST_FILE", len(fresh) - 1)
+    assert_refused(fresh, "it has more than")
 
 
 HARMLESS: dict[str, Tampering] = {
@@ -445,15 +461,15 @@ HARMLESS: dict[str, Tampering] = {
 
 
 @pytest.mark.parametrize("name", HARMLESS)
-def test_harmless(name: str, saved: bytes) -> None:
-    loaded = load(tamper(saved, HARMLESS[name]))
-    np.testing.assert_array_equal(actions_of(loaded), actions_of(load(saved)))
+def test_harmless(name: str, fresh: bytes) -> None:
+    loaded = load(tamper(fresh, HARMLESS[name]))
+    np.testing.assert_array_equal(actions_of(loaded), actions_of(load(fresh)))
     assert loaded.tensorboard_log is None
 
 
-def test_nothing_wakes_up_when_it_is_saved_again(saved: bytes, tmp_path: Path, trace: Path) -> None:
+def test_nothing_wakes_up_when_it_is_saved_again(fresh: bytes, tmp_path: Path, trace: Path) -> None:
     """A value that is plain to us must not be a pickle to SB3 later."""
-    loaded = load(tamper(saved, data_with(_last_obs=pickled(Bomb(trace)), cost_key=":serialized:")))
+    loaded = load(tamper(fresh, data_with(_last_obs=pickled(Bomb(trace)), cost_key=":serialized:")))
     loaded.save(tmp_path / "again")
     assert ESADLEND.load(tmp_path / "again", device="cpu").cost_key == ":serialized:"
 
@@ -511,7 +527,7 @@ def test_damaged_zips(fresh: bytes, edits: list[tuple[str, float, int, int]]) ->
 
 
 @given(st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_damaged_members(fresh: bytes, data: st.DataObject) -> None:
     """With checksums that are right again."""
     members = unpack(fresh)
@@ -529,7 +545,7 @@ JSON_VALUES = st.recursive(
 
 
 @given(st.data())
-@settings(max_examples=80, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_any_value_under_any_key(fresh: bytes, trace: Path, data: st.DataObject) -> None:
     names = [*json.loads(unpack(fresh)["data"]), *dir(ESADLEND)]
     value = data.draw(JSON_VALUES | st.just(pickled(Bomb(trace))))
@@ -537,7 +553,7 @@ def test_any_value_under_any_key(fresh: bytes, trace: Path, data: st.DataObject)
 
 
 @given(st.data())
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_any_description(fresh: bytes, trace: Path, data: st.DataObject) -> None:
     plain = json.loads(unpack(fresh)["sb3_esad.json"])["settings"]
     name = data.draw(st.sampled_from(sorted(plain)))

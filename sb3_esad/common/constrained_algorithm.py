@@ -12,7 +12,7 @@ from sb3_esad.common.functional import barrier_residual
 from sb3_esad.common.latent_algorithm import FALLING_RATE, LatentAlgorithm
 from sb3_esad.common.penalties import Penalty
 from sb3_esad.common.policies import LatentPolicy
-from sb3_esad.common.selection import CALMEST, ActionFilter, NoFilter, SafetyFilter, SelectionRates
+from sb3_esad.common.selection import CALMEST, LARGEST_CHOICE, ActionFilter, NoFilter, SafetyFilter, SelectionRates
 from sb3_esad.common.type_aliases import Belief
 
 
@@ -66,11 +66,15 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
     def _check_arguments(self) -> None:
         super()._check_arguments()
         require(0 < self.barrier_decay <= 1, "barrier_decay", self.barrier_decay, "a rate in (0, 1]")
-        require(self.barrier_steps >= 1, "barrier_steps", self.barrier_steps, "a number of steps >= 1")
         start = self.filter_start
         require(start is None or start >= 0, "filter_start", start, "a number of updates >= 0, or None for no filter")
-        require(self.n_candidates >= 1, "n_candidates", self.n_candidates, "a number of latents >= 1")
-        require(self.n_proposals >= CALMEST, "n_proposals", self.n_proposals, f"a number of actions >= {CALMEST}")
+        self._check_size("n_candidates", 1, LARGEST_CHOICE)
+        self._check_size("n_proposals", CALMEST, LARGEST_CHOICE)
+        self._check_size("barrier_steps", 1, LARGEST_CHOICE // self.n_candidates)
+
+    def _check_size(self, name: str, least: int, most: int) -> None:
+        size = getattr(self, name)
+        require(least <= size <= most, name, size, f"a number from {least} to {most}")
 
     def _setup_model(self) -> None:
         super()._setup_model()

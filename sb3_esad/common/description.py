@@ -13,7 +13,6 @@ import gymnasium as gym
 import stable_baselines3 as sb3
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.buffers import DictReplayBuffer, ReplayBuffer
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
@@ -94,10 +93,9 @@ def named_classes(algorithm: type[OffPolicyAlgorithm]) -> dict[str, type]:
     List the classes that a description may name.
 
     :param algorithm: that is described
-    :return: its policies by their aliases, and replay buffers
+    :return: its policies by their aliases, and the replay buffers
     """
-    buffers = (SequenceReplayBuffer, CostReplayBuffer, ReplayBuffer, DictReplayBuffer)
-    return {**algorithm.policy_aliases, **{each.__name__: each for each in buffers}}
+    return {**algorithm.policy_aliases, **{each.__name__: each for each in (SequenceReplayBuffer, CostReplayBuffer)}}
 
 
 def _versions() -> dict[str, str]:

@@ -11,6 +11,8 @@ from sb3_esad.common.latents import Gaussian, GaussianHead
 from sb3_esad.common.torch_layers import GridShape
 from sb3_esad.common.type_aliases import Logs
 
+MOST_STEPS = 1000
+"""Far more than a sample ever gains from."""
 LEVEL_RATIO = 0.4
 """Of each noise level to the one before."""
 MEMORY = 0.99
@@ -77,7 +79,8 @@ class DiffusionHead(GaussianHead):
         **kwargs: Any,
     ) -> None:
         super().__init__(memory_shape, embedding_channels, latent_channels, hidden_channels, **kwargs)
-        require(diffusion_steps >= 0, "diffusion_steps", diffusion_steps, "a number of steps >= 0, 0 for a Gaussian latent")
+        few = f"a number of steps from 0, for a Gaussian latent, to {MOST_STEPS}"
+        require(0 <= diffusion_steps <= MOST_STEPS, "diffusion_steps", diffusion_steps, few)
         require(start_level > 0, "start_level", start_level, "a multiple > 0")
         self.diffusion_steps = diffusion_steps
         self.start_level = start_level

@@ -111,7 +111,7 @@ class MuonWithAdam(th.optim.Optimizer):
 
 def refuse_misshapen_state(optimizer: th.optim.Optimizer) -> None:
     """
-    Refuse averages that are not of the shape of their parameter: torch's fused kernels would write beyond their end.
+    Refuse, and forget, averages that are not of the shape of their parameter: torch's fused kernels write beyond their end.
 
     :param optimizer: whose state was loaded
     :raises ValueError: if a state belongs to no parameter, or has another shape
@@ -120,6 +120,7 @@ def refuse_misshapen_state(optimizer: th.optim.Optimizer) -> None:
         for name, value in state.items():
             shape = th.Size() if name == "step" else getattr(parameter, "shape", None)
             if isinstance(value, th.Tensor) and value.shape != shape:
+                optimizer.state.clear()
                 raise ValueError(f"The state {name!r} has the shape {tuple(value.shape)}: load one of the same networks.")
 
 

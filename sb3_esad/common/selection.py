@@ -16,6 +16,9 @@ from sb3_esad.common.type_aliases import Belief, LatentState, Logs
 CALMEST = 2
 """How many samples of the actor and how many uniform actions are imagined where the actor's own action is not admissible."""
 
+LARGEST_CHOICE = 10_000
+"""How many states may be imagined and how many actions judged for one decision; whoever shares a model might ask for more."""
+
 
 class Selection(NamedTuple):
     """

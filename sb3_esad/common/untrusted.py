@@ -21,7 +21,7 @@ Algorithm = TypeVar("Algorithm", bound=OffPolicyAlgorithm)
 
 LARGEST_FILE = 2**30
 """Bytes of a model that may be loaded without trust."""
-VARIABLES = "pytorch_variables.pth"
+POLICY, VARIABLES = "policy", "pytorch_variables"
 TEXTS = {"data", DESCRIPTION, "_stable_baselines3_version", "system_info.txt"}
 ENTRY = 100
 """Bytes that torch needs at least for a tensor beside its numbers."""
@@ -79,14 +79,15 @@ def _load(
     settings = {name: value for name, value in values.items() if name in kinds}
     for name in settings.keys() - given.keys():
         _check(name, settings[name], kinds[name])
+    tensors = _read_tensors(members)
     if model.env is not None:
         check_for_correct_spaces(model.env, settings["observation_space"], settings["action_space"])
         settings["n_envs"] = model.env.num_envs
     vars(model).update(settings | given)
-    with _no_larger_than(sum(map(len, members.values()))):
+    with _no_larger_than(len(members.get(f"{POLICY}.pth", b""))):
         model._setup_model()
-    _restore_state(model, {name: read[name] for name in read.keys() - settings.keys() - given.keys()})
-    _restore_tensors(model, members)
+    _restore_counts(model, {name: read[name] for name in read.keys() - settings.keys() - given.keys()})
+    _restore_tensors(model, tensors)
     if model.use_sde:
         model.policy.reset_noise()  # type: ignore[operator]  # as SB3 does, for the sake of other devices
     return model
@@ -105,6 +106,18 @@ def _read_values(algorithm: type[OffPolicyAlgorithm], members: dict[str, bytes])
     return values
 
 
+def _read_tensors(members: dict[str, bytes]) -> dict[str, Any]:
+    """Read all files of tensors, by their names without suffix."""
+    tensors = {}
+    for name, content in members.items():
+        if name.endswith(".pth"):
+            with _naming(name):
+                tensors[name.removesuffix(".pth")] = read_tensors(content)
+        elif name not in TEXTS:
+            raise refusal(f"its member {shown.repr(name)} is none that save() writes")
+    return tensors
+
+
 def _check(name: str, value: Any, annotation: Any) -> None:
     """Refuse a setting that is of another type than the constructor's argument."""
     if value is PICKLED:
@@ -113,18 +126,19 @@ def _check(name: str, value: Any, annotation: Any) -> None:
     parts = get_args(annotation) if get_origin(annotation) in (Union, UnionType) else (annotation,)
     kinds = [kind for part in parts if isinstance(kind := get_origin(part) or part, type)]
     if kinds and not isinstance(value, (*kinds, int) if float in kinds else tuple(kinds)):
-        raise refusal(f"its key {name!r} is {shown.repr(value)}, which is none of {annotation}")
+        wanted = " or ".join(kind.__name__ for kind in kinds)
+        raise refusal(f"its key {name!r} is {shown.repr(value)} instead of a value of {wanted}")
 
 
 @contextmanager
 def _no_larger_than(size: int) -> Iterator[None]:
-    """Refuse networks as soon as they need more bytes than they can have in a file of that size."""
+    """Refuse networks as soon as they need more bytes than the saved ones have."""
 
     def count(module: th.nn.Module, name: str, parameter: th.nn.Parameter) -> None:
         nonlocal size
         size -= parameter.nbytes + ENTRY
         if size < 0:
-            raise refusal("its settings ask for larger networks than it holds")
+            raise refusal(f"its settings ask for larger networks than its member '{POLICY}.pth' has")
 
     hook = register_module_parameter_registration_hook(count)
     try:
@@ -133,8 +147,8 @@ def _no_larger_than(size: int) -> Iterator[None]:
         hook.remove()
 
 
-def _restore_state(model: OffPolicyAlgorithm, values: dict[str, Any]) -> None:
-    """Restore numbers that training has counted; what else was pickled starts anew."""
+def _restore_counts(model: OffPolicyAlgorithm, values: dict[str, Any]) -> None:
+    """Restore what training has counted; what else of it was pickled begins anew."""
     for name, value in values.items():
         if name not in vars(model) or name in model._excluded_save_params():
             raise refusal(f"its key {shown.repr(name)} is no attribute of a saved {type(model).__name__}")
@@ -146,21 +160,19 @@ def _restore_state(model: OffPolicyAlgorithm, values: dict[str, Any]) -> None:
             raise refusal(f"its key {name!r} is {shown.repr(value)} instead of a {type(present).__name__}")
 
 
-def _restore_tensors(model: OffPolicyAlgorithm, members: dict[str, bytes]) -> None:
+def _restore_tensors(model: OffPolicyAlgorithm, tensors: dict[str, Any]) -> None:
     networks, variables = model._get_torch_save_params()
-    files = {VARIABLES, *(f"{name}.pth" for name in networks)}
-    for surplus in members.keys() - files - TEXTS:
-        raise refusal(f"its member {shown.repr(surplus)} is none of a saved {type(model).__name__}")
-    for missing in files - members.keys():
-        raise refusal(f"it has no member {missing!r}", "save or copy it again")
+    for name in tensors.keys() ^ {*networks, VARIABLES}:
+        kind = "is none of" if name in tensors else "is missing, unlike in"
+        raise refusal(f"its member {shown.repr(f'{name}.pth')} {kind} a saved {type(model).__name__}")
     for name in networks:
         with _naming(f"{name}.pth"):
             part = recursive_getattr(model, name)
-            part.load_state_dict(read_tensors(members[f"{name}.pth"]))
+            part.load_state_dict(tensors[name])
             if isinstance(part, th.optim.Optimizer):
                 refuse_misshapen_state(part)
-    with _naming(VARIABLES):
-        _restore_variables(model, variables, read_tensors(members[VARIABLES]))
+    with _naming(f"{VARIABLES}.pth"):
+        _restore_variables(model, variables, tensors[VARIABLES])
 
 
 def _restore_variables(model: OffPolicyAlgorithm, names: list[str], saved: dict[str, th.Tensor]) -> None:
@@ -178,7 +190,7 @@ def _naming(member: str) -> Iterator[None]:
     try:
         yield
     except Exception as error:  # what is read may be anything
-        raise ValueError(f"its member {member!r} does not fit: {_sentence(error)}") from error
+        raise ValueError(f"its member {shown.repr(member)} does not fit: {_sentence(error)}") from error
 
 
 def _sentence(error: Exception) -> str:

@@ -112,10 +112,10 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         self.ent_coef_optimizer.step()
         return ent_coef, {"ent_coef": ent_coef.item(), "ent_coef_loss": loss.item()}
 
-    def _update_critic(self, samples: CostReplaySamples, next_actions: th.Tensor, entropy_cost: th.Tensor) -> Logs:
+    def _update_critic(self, samples: CostReplaySamples, next_actions: th.Tensor, entropy_term: th.Tensor) -> Logs:
         with th.no_grad():
             next_values = th.cat(self.critic_target(samples.next_observations, next_actions), dim=1)
-            next_value = next_values.min(dim=1, keepdim=True).values - entropy_cost
+            next_value = next_values.min(dim=1, keepdim=True).values - entropy_term
             targets = samples.rewards + (1 - samples.dones) * self.gamma * next_value
         values = self.critic(samples.observations, samples.actions)
         loss = 0.5 * th.stack([F.mse_loss(value, targets) for value in values]).sum()
@@ -131,12 +131,12 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         _minimize((mean_loss + variance_loss).mean(), self.policy.cost_critic.optimizer)
         return {"cost_critic_loss": mean_loss.mean().item(), "cost_var_loss": variance_loss.mean().item()}
 
-    def _update_actor(self, observations: PyTorchObs, actions: th.Tensor, entropy_cost: th.Tensor) -> Logs:
+    def _update_actor(self, observations: PyTorchObs, actions: th.Tensor, entropy_term: th.Tensor) -> Logs:
         value = th.cat(self.critic(observations, actions), dim=1).min(dim=1, keepdim=True).values
         means, variance = self.policy.cost_critic(observations, actions)
         # Without the bound, under which the risk would be flat wherever the worst outcomes are all crashes
         risk = capped_cvar(means, variance, self.risk_level, math.inf).max(0).values[:, None]
-        loss = self.penalty.combine(entropy_cost - value, risk, th.zeros_like(risk)).mean()
+        loss = self.penalty.combine(entropy_term - value, risk, th.zeros_like(risk)).mean()
         _minimize(loss, self.actor.optimizer)
         return {"actor_loss": loss.item(), "replayed_risk": risk.mean().item()}
 
@@ -169,5 +169,6 @@ class SACLag(WCSAC):
 def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
     """Minimise a loss by one step of one network; whatever else it passed through stays."""
     optimizer.zero_grad()
-    loss.backward(inputs=[parameter for group in optimizer.param_groups for parameter in group["params"]])
+    parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
+    loss.backward(inputs=[parameter for parameter in parameters if parameter.requires_grad])
     optimizer.step()
