@@ -130,11 +130,11 @@ class View:
         """
         seen = ((shapes >= 0).any(1) & (shapes <= self._limit).any(1)).all(1)  # OpenCV would do this more slowly
         for index in seen.nonzero()[0].tolist():
-            image, shape, colour = images[index], shapes[index], colours[index]
             if is_line[index]:
-                cv2.polylines(image, [shape[:2]], False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+                ends = shapes[index, :2]
+                cv2.polylines(images[index], [ends], False, colours[index], thickness, cv2.LINE_AA, SUBPIXEL_BITS)
             else:
-                cv2.fillConvexPoly(image, shape, colour, cv2.LINE_AA, SUBPIXEL_BITS)
+                cv2.fillConvexPoly(images[index], shapes[index], colours[index], cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -144,10 +144,10 @@ def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
     :param shapes: pixel coordinates of their corners in order, shape ``(n, 4, 2)`` [px / 16]
     :return: the same, smaller
     """
-    sides = shapes[:, _NEXT_CORNER] - shapes
+    sides = shapes.take(_NEXT_CORNER, axis=1) - shapes  # several times faster than an index
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1.0)
     steps = BLEED / lengths[..., None] * sides
-    return np.rint(shapes + steps - steps[:, _LAST_CORNER]).astype(np.int32)
+    return np.rint(shapes + steps - steps.take(_LAST_CORNER, axis=1)).astype(np.int32)
 
 
 def user_grey(traffic: Traffic, row: int) -> int:
@@ -211,7 +211,7 @@ class BirdsEyeView:
         road, users, obstacles = image
         still = frame.near(ground.centres, ground.radii)
         rows = frame.near(traffic.position, traffic.radius)
-        shapes = frame.pixels(np.concatenate([ground.corners[still], stop_lines.corners, traffic.corners[rows]]))
+        shapes = frame.pixels(np.concatenate([ground.corners.take(still, axis=0), stop_lines.corners, traffic.corners[rows]]))
         shapes[len(still) :] = inset(shapes[len(still) :])
         layers = [road] * len(still) + [obstacles] * len(stop_lines.red)
         greys = ground.greys[still].tolist() + [OBSTACLE_GREY if red else AMBER_GREY for red in stop_lines.red]
