@@ -60,10 +60,12 @@ class Frame:
     """
 
     def __init__(self, view: "View", origin: Floats, heading: float) -> None:
+        x, y = origin.tolist()
         cos, sin = math.cos(heading), math.sin(heading)
-        self._turn = np.array([[-sin, cos], [cos, sin]]) * view.scale
-        self._shift = view.centre - origin @ self._turn
-        self._middle = float(origin[0]) + view.reach * cos, float(origin[1]) + view.reach * sin
+        (across, along), (column, row) = view.scale, view.centre
+        self._turn = np.array([[-sin * across, cos * along], [cos * across, sin * along]])
+        self._shift = np.array([column + (x * sin - y * cos) * across, row - (x * cos + y * sin) * along])
+        self._middle = x + view.reach * cos, y + view.reach * sin
         self._radius = view.radius
 
     def near(self, centres: Floats, radii: Floats) -> Ints:
@@ -99,8 +101,10 @@ class View:
     def __init__(self, shape: Sequence[int], metres_per_pixel: Sequence[float], ahead: float) -> None:
         rows, columns = self.shape = (int(shape[0]), int(shape[1]))
         along, across = metres_per_pixel
-        self.scale = np.array([1 / across, -1 / along]) * 2**SUBPIXEL_BITS
-        self.centre = (np.array([columns / 2, rows * ahead]) - 0.5) * 2**SUBPIXEL_BITS  # OpenCV counts from a pixel's centre
+        self.scale = 2**SUBPIXEL_BITS / across, -(2**SUBPIXEL_BITS) / along
+        """Across the image and up it [px / 16 / m]."""
+        self.centre = 2**SUBPIXEL_BITS * (columns / 2 - 0.5), 2**SUBPIXEL_BITS * (rows * ahead - 0.5)
+        """Column and row of the origin; OpenCV counts from the middle of the first pixel [px / 16]."""
         self.reach = (ahead - 0.5) * rows * along
         """How far the middle of the image is ahead of the origin [m]."""
         self.radius = math.hypot((rows / 2 + OUTLINE) * along, (columns / 2 + OUTLINE) * across)
@@ -126,11 +130,11 @@ class View:
         """
         seen = ((shapes >= 0).any(1) & (shapes <= self._limit).any(1)).all(1)  # OpenCV would do this more slowly
         for index in seen.nonzero()[0].tolist():
-            image, shape, colour = images[index], shapes[index], colours[index]
             if is_line[index]:
-                cv2.polylines(image, [shape[:2]], False, colour, thickness, cv2.LINE_AA, SUBPIXEL_BITS)
+                ends = shapes[index, :2]
+                cv2.polylines(images[index], [ends], False, colours[index], thickness, cv2.LINE_AA, SUBPIXEL_BITS)
             else:
-                cv2.fillConvexPoly(image, shape, colour, cv2.LINE_AA, SUBPIXEL_BITS)
+                cv2.fillConvexPoly(images[index], shapes[index], colours[index], cv2.LINE_AA, SUBPIXEL_BITS)
 
 
 def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
@@ -140,23 +144,24 @@ def inset(shapes: NDArray[np.int32]) -> NDArray[np.int32]:
     :param shapes: pixel coordinates of their corners in order, shape ``(n, 4, 2)`` [px / 16]
     :return: the same, smaller
     """
-    sides = shapes[:, _NEXT_CORNER] - shapes
+    sides = shapes.take(_NEXT_CORNER, axis=1) - shapes  # several times faster than an index
     lengths = np.maximum(np.hypot(sides[..., 0], sides[..., 1]), 1.0)
     steps = BLEED / lengths[..., None] * sides
-    return np.rint(shapes + steps - steps[:, _LAST_CORNER]).astype(np.int32)
+    return np.rint(shapes + steps - steps.take(_LAST_CORNER, axis=1)).astype(np.int32)
 
 
-def user_greys(traffic: Traffic) -> Ints:
+def user_grey(traffic: Traffic, row: int) -> int:
     """
-    Grey levels that tell the speed of vehicles, the ego vehicle's span being the smaller; 255 for what must not be hit.
+    Grey level that tells the speed of a vehicle, the ego vehicle's span being the smaller; 255 for what must not be hit.
 
     :param traffic: all road users
-    :return: one grey level per user, never 0, which means that nobody is there, shape ``(n,)``
+    :param row: one of them
+    :return: never 0, which means that nobody is there
     """
-    share = np.minimum(traffic.speed / TOP_SPEED, 1.0)
-    grey = np.where(traffic.is_vehicle, STANDING_GREY + USER_SPAN * share, OBSTACLE_GREY)
-    grey[EGO] = STANDING_GREY + EGO_SPAN * share[EGO]
-    return np.rint(grey).astype(np.int64)
+    if not traffic.is_vehicle[row]:
+        return OBSTACLE_GREY
+    span = EGO_SPAN if row == EGO else USER_SPAN
+    return round(STANDING_GREY + span * min(float(traffic.speed[row]) / TOP_SPEED, 1.0))
 
 
 def draw_dial(image: Image, speed: float) -> None:
@@ -204,15 +209,16 @@ class BirdsEyeView:
         frame = Frame(self.view, traffic.position[EGO], heading)
         image = np.zeros((3, *self.view.shape), dtype=np.uint8)
         road, users, obstacles = image
-        still, rows = frame.near(ground.centres, ground.radii), frame.near(traffic.position, traffic.radius)
-        moves = traffic.is_vehicle[rows] & (rows != EGO)
-        layers = [road] * len(still) + [obstacles] * len(stop_lines.red)
-        layers += [users if moving else obstacles for moving in moves.tolist()]
-        shapes = frame.pixels(np.concatenate([ground.corners[still], stop_lines.corners, traffic.corners[rows]]))
+        still = frame.near(ground.centres, ground.radii)
+        rows = frame.near(traffic.position, traffic.radius)
+        shapes = frame.pixels(np.concatenate([ground.corners.take(still, axis=0), stop_lines.corners, traffic.corners[rows]]))
         shapes[len(still) :] = inset(shapes[len(still) :])
-        lights = np.where(stop_lines.red, OBSTACLE_GREY, AMBER_GREY)
-        greys = np.concatenate([ground.greys[still], lights, user_greys(traffic)[rows]])
+        layers = [road] * len(still) + [obstacles] * len(stop_lines.red)
+        greys = ground.greys[still].tolist() + [OBSTACLE_GREY if red else AMBER_GREY for red in stop_lines.red]
+        for row in rows.tolist():
+            layers.append(users if row != EGO and traffic.is_vehicle[row] else obstacles)
+            greys.append(user_grey(traffic, row))
         is_line = ground.is_line[still].tolist() + [False] * (len(layers) - len(still))
-        self.view.draw(layers, shapes, greys.tolist(), is_line)
+        self.view.draw(layers, shapes, greys, is_line)
         draw_dial(obstacles, float(traffic.speed[EGO]))
         return image

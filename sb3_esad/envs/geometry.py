@@ -1,5 +1,6 @@
 """Oriented boxes: their corners and whether they overlap. x points forward, y to the right, angles turn from x to y."""
 
+import math
 from typing import TypeVar
 
 import numpy as np
@@ -18,8 +19,8 @@ def wrap_angle(angle: AnyFloat) -> AnyFloat:
     :param angle: a number, or an array of any shape [rad]
     :return: the same directions, in [-pi, pi)
     """
-    turned = angle + np.pi
-    return turned - 2 * np.pi * np.floor(turned / (2 * np.pi)) - np.pi  # several times faster than %
+    turned = angle + math.pi
+    return turned - math.tau * np.floor(turned / math.tau) - math.pi  # several times faster than %
 
 
 def bounded(value: Floats, limit: float) -> Floats:

@@ -55,7 +55,7 @@ class RoadUsers:
         self.direction = directions(self.heading)
         self.velocity = self.speed[:, None] * self.direction
         self.corners = placed(self._outline, self.position, self.direction)
-        soon = (self.position + INTENTION_HORIZON * self.velocity)[self.outsiders]
+        soon = (self.position + INTENTION_HORIZON * self.velocity).take(self.outsiders, axis=0)
         along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))
         aside, overshoot = np.abs(across), road.overshoot(along)
         self.along, self.across = along[:, :count], across[:, :count]
@@ -86,9 +86,10 @@ class RoadUsers:
         :return: how far everybody is ahead of each of them, by the projection onto its first lane of who is on none of them [m]; and
             whether it is somebody else who is on one of them; each ``(n, users)``
         """
-        place, there = self.along[outlook.lanes], self.present[outlook.lanes]
+        place = self.along.take(outlook.lanes, axis=0)  # twice as fast as an index
+        there = self.present.take(outlook.lanes, axis=0)
         if outlook.order.size:
-            seen, others = self.present[outlook.further].nonzero()
+            seen, others = self.present.take(outlook.further, axis=0).nonzero()
             beyond = ~there[outlook.order[seen], others]
             seen, others = seen[beyond], others[beyond]
             where = outlook.order[seen], others

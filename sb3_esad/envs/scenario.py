@@ -121,13 +121,6 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         return self.episode.steps >= self.max_episode_steps
 
     @property
-    def heading_error(self) -> float:
-        """Angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
-        traffic, lane = self.traffic, int(self.traffic.lane[EGO])
-        along_lane = self.road.lanes[lane].heading_at(float(traffic.along[lane, EGO]))
-        return float(wrap_angle(float(traffic.heading[EGO]) - along_lane))
-
-    @property
     def stop_lines(self) -> StopLines:
         """The lines before lights that are not green."""
         return NO_LINES
@@ -153,8 +146,8 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.ground = Ground(self.road.markings, self.route.contains)
         self.traffic = self._make_traffic()
         self.episode = self._start_episode()
-        self.collided = False
-        self.off_road = False
+        self.collided = self.off_road = False
+        self._note_heading()
         if self.render_mode == "human":
             self.render()
         return self.observation.observe(self), self._state()
@@ -207,9 +200,16 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             self._check_crash()
             if self.crashed:
                 break
-        self.wrong_way = abs(self.heading_error) > math.pi / 2
+        self._note_heading()
         on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self.wrong_way
         self.episode.add_motion(duration, metres, self._progress(), on_route)
+
+    def _note_heading(self) -> None:
+        """Set the angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
+        traffic, lane = self.traffic, int(self.traffic.lane[EGO])
+        along_lane = self.road.lanes[lane].heading_at(float(traffic.along[lane, EGO]))
+        self.heading_error = float(wrap_angle(float(traffic.heading[EGO]) - along_lane))
+        self.wrong_way = abs(self.heading_error) > math.pi / 2
 
     def _check_crash(self) -> None:
         hit = users_hit(self.traffic)

@@ -40,7 +40,7 @@ class Traffic(RoadUsers):
         self.temper = {f.name: np.array([getattr(user.temper, f.name) for user in users]) for f in fields(Temper)}
         own = self.temper
         braking = 2 * np.sqrt(own["acceleration"] * own["braking"])
-        self._following = (own["acceleration"], own["exponent"], own["gap"], own["headway"], braking)
+        self._following = np.stack([own["acceleration"], own["exponent"], own["gap"], own["headway"], braking])
         self.forced_braking = np.zeros(len(users))  # a scenario makes a car brake this hard, whatever it would do [m/s^2]
         self.stop_distance = np.full(len(users), np.inf)  # to a line before which a car must wait, from its centre [m]
         self._first_change = np.where(road.continues, BLIND_BEHIND, 0.0)  # from here on one may change to each lane [m]
@@ -69,7 +69,7 @@ class Traffic(RoadUsers):
         :param judges: the users whose temper is applied, shape ``(n,)``
         :return: accelerations, shape ``(n,)`` [m/s^2]
         """
-        acceleration, exponent, gap, headway, braking = (each[judges] for each in self._following)
+        acceleration, exponent, gap, headway, braking = self._following.take(judges, axis=1)
         speed = self.speed[rows]
         desired = np.maximum(np.minimum(self.target_speed[rows], self.speed_limit[rows]), LEAST)
         distance = np.maximum(np.abs(self.distance(rows, front)), LEAST)
@@ -87,7 +87,7 @@ class Traffic(RoadUsers):
         :return: infinite for who need not wait, shape ``(n,)`` [m/s^2]
         """
         distance, speed = self.stop_distance[rows], self.speed[rows]
-        acceleration, _, _, _, braking = (each[rows] for each in self._following)
+        acceleration, _, _, _, braking = self._following.take(rows, axis=1)
         wanted = STOP_GAP + STOP_HEADWAY * speed + speed**2 / braking
         free = acceleration * (1.0 - (speed / np.maximum(self.target_speed[rows], LEAST)) ** 4)
         stopping = free - acceleration * (wanted / np.maximum(distance, 0.1)) ** 2
@@ -246,7 +246,7 @@ class Traffic(RoadUsers):
             return False
         distance = self.distance(np.full_like(rivals, row), rivals)
         closing = (self.velocity[row] - self.velocity[rivals]) @ self.direction[row]
-        _, _, gap, headway, braking = (each[row] for each in self._following)
+        _, _, gap, headway, braking = self._following[:, row]
         wanted = gap + self.speed[row] * headway + self.speed[row] * closing / braking
         return bool(np.any((distance > 0) & (distance < wanted)))
 
