@@ -158,12 +158,11 @@ class SACLag(WCSAC):
     SAC-Lag: :class:`WCSAC` that limits the mean of the cost, not that of its worst outcomes.
 
     :param args: see :class:`WCSAC`
-    :param risk_level: likewise
-    :param kwargs: likewise
+    :param kwargs: likewise; the default of ``risk_level`` is 1
     """
 
-    def __init__(self, *args: Any, risk_level: float = 1.0, **kwargs: Any) -> None:
-        super().__init__(*args, risk_level=risk_level, **kwargs)
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        super().__init__(*args, **{"risk_level": 1.0, **kwargs})
 
 
 def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
