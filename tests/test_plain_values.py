@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from stable_baselines3.common.type_aliases import TrainFreq, TrainFrequencyUnit
 from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 
-from sb3_esad.common.plain_values import LARGEST_BOX, from_plain, to_plain
+from sb3_esad.common.plain_values import LARGEST_SPACE, from_plain, to_plain
 from sb3_esad.common.schedules import HoldThenFall
 
 SHAPES = st.lists(st.integers(1, 4), min_size=1, max_size=3).map(tuple)
@@ -107,7 +107,7 @@ BOX = {"low": 0, "high": 1, "shape": [2], "dtype": "float32"}
         {"exec": {"source": "print()"}},
         {"builtins.exec": ["print()"]},
         {"Box": {**BOX, "shape": [10**6, 10**6]}},
-        {"Box": {**BOX, "shape": [LARGEST_BOX + 1]}},
+        {"Box": {**BOX, "shape": [LARGEST_SPACE + 1]}},
         {"Box": {**BOX, "shape": [-5]}},
         {"Box": {**BOX, "dtype": "O"}},
         {"Box": {**BOX, "dtype": "<U100000000"}},
@@ -116,6 +116,8 @@ BOX = {"low": 0, "high": 1, "shape": [2], "dtype": "float32"}
         {"Box": {**BOX, "low": "nan"}},
         {"Box": {**BOX, "low": 2}},
         {"Dict": {"a": {"Text": {}}}},
+        {"Dict": {"a": {"Dict": {}}}},
+        {"Dict": {str(i): {"Box": {**BOX, "shape": [LARGEST_SPACE // 2]}} for i in range(1000)}},
         {"Discrete": {"n": -1, "start": 0, "dtype": "int64"}},
         {"HoldThenFall": {"start": 1, "hold": 2}},
         {"HoldThenFall": {"start": 1, "hold": 0.5, "extra": 1}},

@@ -79,6 +79,11 @@ def fresh() -> bytes:
     return zipped(ESADLEND("MlpPolicy", make_env(), **TINY))
 
 
+@pytest.fixture(scope="module")
+def fresh_actions(fresh: bytes) -> np.ndarray:
+    return actions_of(load(fresh))
+
+
 # Ours: the same either way
 
 
@@ -106,7 +111,7 @@ def test_training_goes_on(saved: bytes) -> None:
 
 
 def test_another_environment_is_refused(saved: bytes) -> None:
-    assert_refused(saved, "Observation spaces do not match", env=CountingEnv())
+    assert_refused(saved, "Observation spaces do not match", "give an environment like", env=CountingEnv())
 
 
 def test_paths_and_file_objects(saved: bytes, tmp_path: Path) -> None:
@@ -223,9 +228,9 @@ BEGUN_ANEW = {"_last_obs", "_last_episode_starts", "_last_original_obs", "ep_inf
 COUNTS = {"num_timesteps", "_n_updates", "_total_timesteps", "start_time", "total_cost"}
 
 
-def test_code_that_is_not_looked_at(fresh: bytes, trace: Path) -> None:
+def test_code_that_is_not_looked_at(fresh: bytes, fresh_actions: np.ndarray, trace: Path) -> None:
     bombs = {name: pickled(Bomb(trace)) for name in {*REBUILT, *BEGUN_ANEW, *COUNTS, "tensorboard_log"}}
-    np.testing.assert_array_equal(actions_of(load(tamper(fresh, data_with(**bombs)))), actions_of(load(fresh)))
+    np.testing.assert_array_equal(actions_of(load(tamper(fresh, data_with(**bombs)))), fresh_actions)
 
 
 def test_code_in_the_data(fresh: bytes, trace: Path) -> None:
@@ -336,7 +341,7 @@ TAMPERINGS: dict[str, tuple[Tampering, str]] = {
     "layers": (policy_kwargs(net_arch=[1] * 10**5), "larger networks"),
     "memory": (policy_kwargs(memory_channels=10**7), "larger networks"),
     "heads": (policy_kwargs(world_model_kwargs={"units": 10**8}), "larger networks"),
-    "pixels": (setting("observation_space", box([10**6, 10**6])), "The size of a Box is 1000000000000"),
+    "pixels": (setting("observation_space", box([10**6, 10**6])), "The size of a space is 1000000000000"),
     "a long observation": (setting("observation_space", box([10**6])), "larger networks"),
     "choices": (setting("observation_space", {"Discrete": {"n": 10**15, "start": 0, "dtype": "int64"}}), ""),
     "switches": (setting("observation_space", {"MultiBinary": {"n": 10**12}}), ""),
@@ -461,9 +466,9 @@ HARMLESS: dict[str, Tampering] = {
 
 
 @pytest.mark.parametrize("name", HARMLESS)
-def test_harmless(name: str, fresh: bytes) -> None:
+def test_harmless(name: str, fresh: bytes, fresh_actions: np.ndarray) -> None:
     loaded = load(tamper(fresh, HARMLESS[name]))
-    np.testing.assert_array_equal(actions_of(loaded), actions_of(load(fresh)))
+    np.testing.assert_array_equal(actions_of(loaded), fresh_actions)
     assert loaded.tensorboard_log is None
 
 
@@ -519,15 +524,15 @@ def edited(content: bytes, edits: list[tuple[str, float, int, int]]) -> bytes:
 
 
 @given(EDITS)
-@settings(max_examples=120, deadline=None)
-def test_damaged_zips(fresh: bytes, edits: list[tuple[str, float, int, int]]) -> None:
+@settings(max_examples=100, deadline=None)
+def test_damaged_zips(fresh: bytes, fresh_actions: np.ndarray, edits: list[tuple[str, float, int, int]]) -> None:
     loaded = attempt(edited(fresh, edits))
     if loaded is not None:  # what is not protected by checksums means nothing
-        np.testing.assert_array_equal(actions_of(loaded), actions_of(load(fresh)))
+        np.testing.assert_array_equal(actions_of(loaded), fresh_actions)
 
 
 @given(st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=20, deadline=None)
 def test_damaged_members(fresh: bytes, data: st.DataObject) -> None:
     """With checksums that are right again."""
     members = unpack(fresh)
@@ -545,7 +550,7 @@ JSON_VALUES = st.recursive(
 
 
 @given(st.data())
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=25, deadline=None)
 def test_any_value_under_any_key(fresh: bytes, trace: Path, data: st.DataObject) -> None:
     names = [*json.loads(unpack(fresh)["data"]), *dir(ESADLEND)]
     value = data.draw(JSON_VALUES | st.just(pickled(Bomb(trace))))

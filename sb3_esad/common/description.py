@@ -41,8 +41,9 @@ def settings_of(model: OffPolicyAlgorithm) -> dict[str, Any]:
     :return: their names and annotations
     """
     annotations: dict[str, Any] = {}
-    for each in reversed(type(model).__mro__):
-        for name, parameter in inspect.signature(each).parameters.items():
+    constructors = [vars(each)["__init__"] for each in reversed(type(model).__mro__) if "__init__" in vars(each)]
+    for constructor in constructors:
+        for name, parameter in inspect.signature(constructor).parameters.items():
             annotations[name] = object if parameter.annotation in (Parameter.empty, Any) else parameter.annotation
     named = vars(model).keys() - set(model._excluded_save_params())
     given = {name: annotation for name, annotation in annotations.items() if name in named}
@@ -99,10 +100,10 @@ def named_classes(algorithm: type[OffPolicyAlgorithm]) -> dict[str, type]:
 
 
 def _versions() -> dict[str, str]:
-    own = resources.files("sb3_esad").joinpath("version.txt").read_text().strip()
-    others = {"stable_baselines3": sb3, "gymnasium": gym, "torch": th}
     return {
-        "sb3_esad": own,
-        **{name: module.__version__ for name, module in others.items()},
+        "sb3_esad": resources.files("sb3_esad").joinpath("version.txt").read_text().strip(),
+        "stable_baselines3": sb3.__version__,
+        "gymnasium": gym.__version__,
+        "torch": th.__version__,
         "python": platform.python_version(),
     }

@@ -12,8 +12,8 @@ from stable_baselines3.common.utils import ConstantSchedule, LinearSchedule
 from sb3_esad.common.checks import require
 from sb3_esad.common.schedules import HoldThenFall
 
-LARGEST_BOX = 2**24
-"""Numbers in an observation; an image of 4096x4096 pixels has as many."""
+LARGEST_SPACE = 2**22
+"""Numbers in an observation; an image of 2048x2048 pixels has as many."""
 
 
 class Form(NamedTuple):
@@ -80,10 +80,13 @@ def _bound(bound: np.ndarray) -> Any:
 
 
 def _build_box(low: Any, high: Any, shape: list[int], dtype: str) -> spaces.Box:
-    size = math.prod(shape)
-    require(0 <= size <= LARGEST_BOX, "The size of a Box", size, f"one of at most {LARGEST_BOX} numbers")
+    _check_size(math.prod(shape))
     low, high = (np.full(shape, np.asarray(bound, dtype=_dtype(dtype))) for bound in (low, high))
     return spaces.Box(low, high, dtype=_dtype(dtype))
+
+
+def _check_size(size: int) -> None:
+    require(0 <= size <= LARGEST_SPACE, "The size of a space", size, f"one of at most {LARGEST_SPACE} numbers")
 
 
 def _build_discrete(n: int, start: int, dtype: str) -> spaces.Discrete:
@@ -100,7 +103,13 @@ def _describe_schedule(schedule: Any) -> dict[str, float]:
 
 
 def _build_dict(**parts: Any) -> spaces.Dict:
-    return spaces.Dict([(key, from_plain(part)) for key, part in parts.items()])  # a dictionary would be sorted anew
+    built, size = [], 0
+    for key, part in parts.items():
+        space = from_plain(part)
+        size += math.prod(space.shape)
+        _check_size(size)
+        built.append((key, space))
+    return spaces.Dict(built)  # in this order, which a dictionary would not keep
 
 
 FORMS: dict[type, Form] = {

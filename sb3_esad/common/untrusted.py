@@ -10,6 +10,7 @@ from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.save_util import recursive_getattr
 from stable_baselines3.common.type_aliases import GymEnv
 from stable_baselines3.common.utils import check_for_correct_spaces
+from stable_baselines3.common.vec_env import VecEnv
 from torch.nn.modules.module import register_module_parameter_registration_hook
 
 from sb3_esad.common.description import DESCRIPTION, is_pickled, read_setting, settings_of
@@ -81,7 +82,7 @@ def _load(
         _check(name, settings[name], kinds[name])
     tensors = _read_tensors(members)
     if model.env is not None:
-        check_for_correct_spaces(model.env, settings["observation_space"], settings["action_space"])
+        _check_env(model.env, settings)
         settings["n_envs"] = model.env.num_envs
     vars(model).update(settings | given)
     with _no_larger_than(len(members.get(f"{POLICY}.pth", b""))):
@@ -128,6 +129,13 @@ def _check(name: str, value: Any, annotation: Any) -> None:
     if kinds and not isinstance(value, (*kinds, int) if float in kinds else tuple(kinds)):
         wanted = " or ".join(kind.__name__ for kind in kinds)
         raise refusal(f"its key {name!r} is {shown.repr(value)} instead of a value of {wanted}")
+
+
+def _check_env(env: VecEnv, settings: dict[str, Any]) -> None:
+    try:
+        check_for_correct_spaces(env, settings["observation_space"], settings["action_space"])
+    except ValueError as error:
+        raise refusal(str(error), "give an environment like the one that it has learned in") from error
 
 
 @contextmanager
