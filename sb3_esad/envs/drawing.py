@@ -4,19 +4,18 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from sb3_esad.envs.bev import DASH_GREY, LINE_GREY, OFF_ROUTE_GREY, ROUTE_GREY, Frame, View
+from sb3_esad.envs.bev import DASH_GREY, LINE_GREY, OFF_ROUTE_GREY, ROUTE_GREY
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 from sb3_esad.envs.users import Kind
+from sb3_esad.envs.view import Frame, Image, View
 
-Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 SIZE, AHEAD, ZOOM = (960, 320), 0.75, 10.0  # [px], share of what is seen, and pixels for each of those of the agent's image
-GRASS, PAINT = (44, 62, 48), (225, 225, 225)
-GROUND_COLOURS = {OFF_ROUTE_GREY: (70, 70, 74), ROUTE_GREY: (92, 92, 98), DASH_GREY: PAINT, LINE_GREY: PAINT}
+GRASS, ASPHALT, ROUTE, PAINT = (44, 62, 48), (70, 70, 74), (92, 92, 98), (225, 225, 225)
+GROUND_COLOURS = {OFF_ROUTE_GREY: ASPHALT, ROUTE_GREY: ROUTE, DASH_GREY: PAINT, LINE_GREY: PAINT}
 EGO_COLOUR, CRASH_COLOUR, STATIC_COLOUR, PERSON_COLOUR = (64, 220, 110), (235, 60, 50), (240, 150, 40), (240, 90, 200)
 RED, AMBER = (220, 40, 40), (240, 180, 40)
 SLOW_COLOUR, FAST_COLOUR = np.array([60.0, 90.0, 170.0]), np.array([130.0, 200.0, 255.0])

@@ -61,9 +61,8 @@ class RoadUsers:
         self.along, self.across = along[:, :count], across[:, :count]
         self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)
         self.off_road = not all(road.covers(aside[:, -4:], overshoot[:, -4:]))
-        lane = road.closest_lane(
-            along[:, :-4], (aside + overshoot)[:, :-4], self.heading[self._now_and_soon], self._handicap
-        )
+        heading, distance = self.heading[self._now_and_soon], aside + overshoot
+        lane = road.closest_lane(along[:, :-4], distance[:, :-4], heading, self._handicap)
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
         self._note_intentions(aside[:, count:])
         self.outlook = self.paths.outlook(self._rows, self.lane)
@@ -83,8 +82,8 @@ class RoadUsers:
         Place everybody along the lanes that some users look along.
 
         :param outlook: of n users
-        :return: how far everybody is ahead of each of them, by the projection onto its first lane of who is on none of them [m]; and
-            whether it is somebody else who is on one of them; each ``(n, users)``
+        :return: how far everybody is ahead of each of them, by the projection onto its first lane of who is on none of these
+            [m]; and whether it is somebody else who is on one of them; both ``(n, users)``
         """
         place = self.along.take(outlook.lanes, axis=0)  # twice as fast as an index
         there = self.present.take(outlook.lanes, axis=0)
