@@ -4,14 +4,13 @@ from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
-from sb3_esad.envs.bev import DASH_GREY, LINE_GREY, OFF_ROUTE_GREY, ROUTE_GREY, Frame, View
+from sb3_esad.envs.bev import DASH_GREY, LINE_GREY, OFF_ROUTE_GREY, ROUTE_GREY
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.scenario import Scenario
 from sb3_esad.envs.users import Kind
+from sb3_esad.envs.view import Frame, Image, View
 
-Image = NDArray[np.uint8]
 Colour = tuple[int, int, int]
 
 SIZE, AHEAD, ZOOM = (960, 320), 0.75, 10.0  # [px], share of what is seen, and pixels for each of those of the agent's image

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 AnyFloat = TypeVar("AnyFloat", float, Floats)
+FloatKind = TypeVar("FloatKind", bound=np.floating)
 
 _UNIT_CORNERS = np.array([[0.5, 0.5, -0.5, -0.5], [-0.5, 0.5, 0.5, -0.5]])[..., None]
 
@@ -23,7 +24,7 @@ def wrap_angle(angle: AnyFloat) -> AnyFloat:
     return turned - math.tau * np.floor(turned / math.tau) - math.pi  # several times faster than %
 
 
-def bounded(value: Floats, limit: float) -> Floats:
+def bounded(value: NDArray[FloatKind], limit: float) -> NDArray[FloatKind]:
     """
     Keep values within plus and minus a limit; several times faster than ``np.clip`` on short arrays.
 

@@ -7,7 +7,7 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_esad.envs.bev import BirdsEyeView, Ground, View
+from sb3_esad.envs.bev import BirdsEyeView, Ground
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.lanes import LANE_WIDTH
 from sb3_esad.envs.lights import StopLines
@@ -15,6 +15,7 @@ from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Road
 from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
+from sb3_esad.envs.view import View
 
 SPEED_SCALE, DISTANCE_SCALE, WIDTH_SCALE = 30.0, 100.0, 16.0  # [m/s], [m], [m]
 EGO_FEATURES = ("speed", "heading_error", "lane_offset", "route_left", "room_left", "room_right")

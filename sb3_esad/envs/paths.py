@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_esad.envs.geometry import Floats
 from sb3_esad.envs.lanes import NO_LANE
-from sb3_esad.envs.roads import Bools, Ints, Road
+from sb3_esad.envs.roads import Ints, Road
 from sb3_esad.envs.users import User
 
 OFF_PATH = 1.5  # where lanes overlap, one is on that of one's path even if another is as much nearer [m]
@@ -70,18 +70,17 @@ class Paths:
         """
         Go on from every lane as every user would.
 
-        :return: the lanes ahead, the furthest first, ``NO_LANE`` past the last one, and how far they start from the start of the
-            first [m]; each ``(users, lanes, LOOKAHEAD)``
+        :return: the lanes ahead, the furthest first, ``NO_LANE`` past the last one, and how far each starts from the start of
+            the first [m]; both ``(users, lanes, LOOKAHEAD)``
         """
         users = np.arange(len(self.next_lane))[:, None]
         lanes, passed = np.tile(np.arange(len(road.lanes)), (len(users), 1)), np.zeros(self.next_lane.shape)
-        further, starts = [], []
-        for _ in range(LOOKAHEAD):
+        further, starts = (np.empty((*lanes.shape, LOOKAHEAD), dtype=kind) for kind in (np.int64, np.float64))
+        for place in reversed(range(LOOKAHEAD)):
             passed = passed + road.length[lanes]
             lanes = np.where(lanes == NO_LANE, NO_LANE, self.next_lane[users, lanes])
-            further.insert(0, lanes)
-            starts.insert(0, passed)
-        return np.stack(further, axis=-1), np.stack(starts, axis=-1)
+            further[..., place], starts[..., place] = lanes, passed
+        return further, starts
 
     def outlook(self, rows: Ints, lanes: Ints) -> Outlook:
         """

@@ -10,7 +10,6 @@ from sb3_esad.envs.paths import LOOKAHEAD
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Bools, Road
 from sb3_esad.envs.traffic import Traffic
-from sb3_esad.envs.users import Kind
 
 ZONE = 25.0  # from here on one queues up, where there are no lights [m]
 HARD_BRAKING = 6.0  # a red light is for those who can still stop like this [m/s^2]
@@ -45,7 +44,7 @@ class RightOfWay:
 
     def __init__(self, crossings: Crossings, zone: float = ZONE) -> None:
         self._zone = zone
-        self._way_of, self._crosses = crossings.way_of, crossings.crosses
+        self._way_of, self._crosses = crossings.way_of.tolist(), crossings.crosses
         self._queue: dict[int, int] = {}
 
     def regulate(self, traffic: Traffic, red: Bools | None = None, setback: float = 0.0) -> None:
@@ -56,7 +55,7 @@ class RightOfWay:
         :param red: whether each way has a red light; who waits there is in nobody's way
         :param setback: how far before the junction one stops [m]
         """
-        vehicles = np.flatnonzero(traffic.kind == Kind.VEHICLE).tolist()
+        vehicles = np.flatnonzero(traffic.is_vehicle).tolist()
         places = {row: place for row in vehicles if (place := self.way_ahead(traffic, row))}
         queue = {row: way for row, way in self._queue.items() if row in places and places[row][0] == way}
         newcomers = sorted((distance, row) for row, (_, distance) in places.items() if row not in queue)
@@ -86,9 +85,9 @@ class RightOfWay:
         lane = int(traffic.lane[row] if row == EGO else traffic.target_lane[row])
         distance = -float(traffic.along[lane, row])
         for _ in range(LOOKAHEAD):
-            if self._way_of[lane] != NO_LANE:
-                return int(self._way_of[lane]), distance
-            distance += float(traffic.road.length[lane])
+            if (way := self._way_of[lane]) != NO_LANE:
+                return way, distance
+            distance += traffic.road.lanes[lane].length
             if distance > self._zone:
                 return None
             lane = int(traffic.paths.next_lane[row, lane])

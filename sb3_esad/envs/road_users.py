@@ -34,7 +34,8 @@ class RoadUsers:
         self.half_length = self.size[:, 0] / 2
         self.radius = np.hypot(self.size[:, 0], self.size[:, 1]) / 2
         self.kind = np.array([user.kind for user in users], dtype=np.int64)
-        self.is_vehicle = self.kind == Kind.VEHICLE
+        self.is_vehicle, self.is_person = self.kind == Kind.VEHICLE, self.kind == Kind.PERSON
+        self._any_person = bool(self.is_person.any())
         self.drives = np.array([user.drives for user in users])
         self.drivers, self.outsiders = np.flatnonzero(self.drives), np.flatnonzero(~self.drives)
         self.acceleration = np.zeros(len(users))
@@ -42,7 +43,6 @@ class RoadUsers:
         self._rows = np.arange(len(users))
         margin = np.where(self.kind == Kind.STATIC, self.size[:, 1] / 2, LANE_MARGIN)
         self._berth = road.width[:, None] / 2 + margin
-        self._any_on_foot = bool((self.kind == Kind.PERSON).any())
         self.paths = Paths(road, users)
         self._now_and_soon = np.concatenate([self._rows, self.outsiders])
         self._handicap = self.paths.handicap[self._now_and_soon].T.copy()
@@ -61,9 +61,8 @@ class RoadUsers:
         self.along, self.across = along[:, :count], across[:, :count]
         self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)
         self.off_road = not all(road.covers(aside[:, -4:], overshoot[:, -4:]))
-        lane = road.closest_lane(
-            along[:, :-4], (aside + overshoot)[:, :-4], self.heading[self._now_and_soon], self._handicap
-        )
+        heading, distance = self.heading[self._now_and_soon], aside + overshoot
+        lane = road.closest_lane(along[:, :-4], distance[:, :-4], heading, self._handicap)
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
         self._note_intentions(aside[:, count:])
         self.outlook = self.paths.outlook(self._rows, self.lane)
@@ -73,9 +72,9 @@ class RoadUsers:
     def _note_intentions(self, soon_aside: Floats) -> None:
         """Others make room for a user that they do not steer in the lane where it will soon be, too."""
         rows = self.outsiders
-        if self._any_on_foot:  # people beside the road are in nobody's way
+        if self._any_person:  # people beside the road are in nobody's way
             soon_off = soon_aside[self.target_lane[rows], np.arange(len(rows))]
-            rows = rows[(self.kind[rows] != Kind.PERSON) | (soon_off <= LANE_WIDTH / 2)]
+            rows = rows[~self.is_person[rows] | (soon_off <= LANE_WIDTH / 2)]
         self.present[self.target_lane[rows], rows] = True
 
     def gaps(self, outlook: Outlook) -> tuple[Floats, Bools]:
@@ -83,8 +82,8 @@ class RoadUsers:
         Place everybody along the lanes that some users look along.
 
         :param outlook: of n users
-        :return: how far everybody is ahead of each of them, by the projection onto its first lane of who is on none of them [m]; and
-            whether it is somebody else who is on one of them; each ``(n, users)``
+        :return: how far everybody is ahead of each of them, by the projection onto its first lane of who is on none of these
+            [m]; and whether it is somebody else who is on one of them; both ``(n, users)``
         """
         place = self.along.take(outlook.lanes, axis=0)  # twice as fast as an index
         there = self.present.take(outlook.lanes, axis=0)

@@ -51,7 +51,7 @@ class Walkers:
         :param traffic: all road users; speeds and headings of the people are set
         :param time: since the start [s]
         """
-        rows = np.flatnonzero(traffic.kind == Kind.PERSON)
+        rows = np.flatnonzero(traffic.is_person)
         offset = self._ends[np.arange(len(rows)), self._goal] - traffic.position[rows]
         arrived = np.flatnonzero((np.hypot(offset[:, 0], offset[:, 1]) < self._speed / 4) & (time >= self._departure))
         self._goal[arrived] = 1 - self._goal[arrived]
@@ -66,7 +66,7 @@ class Walkers:
 
     def _must_wait(self, traffic: Traffic, rows: Ints) -> Bools:
         """Nobody walks into a car, nor right in front of one; who is in front of one already walks on."""
-        cars = np.flatnonzero(traffic.kind == Kind.VEHICLE)
+        cars = np.flatnonzero(traffic.is_vehicle)
         stands, heading = traffic.speed[cars] < 0.1, traffic.heading[rows]
         step = (
             np.where(stands, LOOK_NEAR_STANDING * self._speed, LOOK)[:, None]
