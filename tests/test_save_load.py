@@ -222,7 +222,7 @@ def test_policy_alone_keeps_its_arguments(tmp_path: Path) -> None:
     }
     model = ESADLEND("MlpPolicy", CountingEnv(), **{**TINY, "policy_kwargs": policy_kwargs})
     model.policy.save(str(tmp_path / "policy.pt"))
-    loaded = LatentPolicy.load(str(tmp_path / "policy.pt"), device="cpu")
+    loaded = type(model.policy).load(str(tmp_path / "policy.pt"), device="cpu")
     for name, value in policy_kwargs.items():
         assert getattr(loaded, name) == value
 
