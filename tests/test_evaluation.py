@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 import torch as th
 from conftest import CountingEnv
+from gymnasium.wrappers import RecordVideo
 from stable_baselines3 import SAC
-from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize
+from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecVideoRecorder
 
 from sb3_esad import ESADLEND, WCSAC
 from sb3_esad.common.type_aliases import LatentState
@@ -364,3 +365,21 @@ def test_records_count_the_cost_that_was_asked_for() -> None:
     for _ in range(4):
         env.step(env.action_space.sample())
     assert [record["cost"] for record in env.records] == [2.0]
+
+
+def test_the_recorders_of_gymnasium_and_sb3_film_a_scenario(tmp_path: Path) -> None:
+    env = RecordVideo(gym.make("short-vector-v0", render_mode="rgb_array"), str(tmp_path / "gymnasium"), disable_logger=True)
+    env.reset(seed=0)
+    while not any(env.step(np.zeros(2, dtype=np.float32))[2:4]):
+        pass
+    env.close()
+    vec_env = DummyVecEnv([lambda: gym.make("short-vector-v0", render_mode="rgb_array")])
+    film = VecVideoRecorder(vec_env, str(tmp_path / "sb3"), record_video_trigger=lambda step: step == 0, video_length=5)
+    film.reset()
+    for _ in range(6):
+        film.step(np.zeros((1, 2), dtype=np.float32))
+    film.close()
+    for folder in ("gymnasium", "sb3"):
+        (path,) = (tmp_path / folder).glob("*.mp4")
+        n_frames, shape, _ = read_video(path)
+        assert n_frames >= 5 and shape == (320, 960, 3)
