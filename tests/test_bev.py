@@ -3,13 +3,14 @@
 import numpy as np
 import pytest
 
-from sb3_esad.envs.bev import BirdsEyeView, View
+from sb3_esad.envs.bev import BirdsEyeView, Ground
 from sb3_esad.envs.geometry import box_corners
 from sb3_esad.envs.highway import highway_road
 from sb3_esad.envs.lights import NO_LINES, StopLines
 from sb3_esad.envs.roads import Markings
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
+from sb3_esad.envs.view import Frame, View
 
 SHAPE, SCALE, AHEAD = (64, 64), (1.25, 0.4), 0.775
 BARE = Markings(np.zeros((0, 4, 2)), np.zeros(0, bool), np.zeros((0, 2, 2)), np.zeros(0, bool))
@@ -31,7 +32,7 @@ def ego(x: float = 50.0, y: float = 4.0, heading: float = 0.0, speed: float = 25
 
 def see(*users: User, markings: Markings = ROAD.markings, heading: float = 0.0) -> np.ndarray:
     """Image of a scene as signed numbers."""
-    return BEV.draw(markings, ROUTE, scene(*users), NO_LINES, heading).astype(int)
+    return BEV.draw(Ground(markings, ROUTE), scene(*users), NO_LINES, heading).astype(int)
 
 
 @pytest.mark.parametrize("frame", ["lane", "ego"])
@@ -123,7 +124,7 @@ def test_an_empty_world_is_black_but_for_the_ego_vehicle() -> None:
 
 def test_other_sizes_and_scales() -> None:
     view = View((96, 48), (1.0, 0.5), 0.75)
-    image = BirdsEyeView(view).draw(ROAD.markings, ROUTE, scene(ego()), NO_LINES, 0.0)
+    image = BirdsEyeView(view).draw(Ground(ROAD.markings, ROUTE), scene(ego()), NO_LINES, 0.0)
     assert image.shape == (3, 96, 48)
     assert image.dtype == np.uint8
     assert np.flatnonzero(image[2][:, 4:-4].any(1)).mean() == pytest.approx(96 * 0.75 - 0.5, abs=1.0)
@@ -132,7 +133,25 @@ def test_other_sizes_and_scales() -> None:
 def test_an_amber_light_s_line_is_less_bright_than_a_red_one_s() -> None:
     places = ((70.0, 2.0), (80.0, 6.0))
     corners = box_corners(np.array(places), np.zeros(2), np.array([[4.0, 3.0]] * 2))
-    image = BEV.draw(BARE, ROUTE, scene(ego()), StopLines(corners, np.array([True, False])), 0.0)[2]
+    image = BEV.draw(Ground(BARE, ROUTE), scene(ego()), StopLines(corners, np.array([True, False])), 0.0)[2]
     values = set(np.unique(image).tolist())
     assert {255, 210} <= values
-    assert not {255, 210} & set(np.unique(BEV.draw(BARE, ROUTE, scene(ego()), NO_LINES, 0.0)[2]).tolist())
+    assert not {255, 210} & set(np.unique(BEV.draw(Ground(BARE, ROUTE), scene(ego()), NO_LINES, 0.0)[2]).tolist())
+
+
+def test_who_is_left_out_early_leaves_no_trace() -> None:
+    """Shapes around the edges of the view are the same picture if all of them are drawn, wherever they are."""
+    random = np.random.default_rng(0)
+    for _ in range(200):
+        origin, heading = random.uniform(-100.0, 100.0, 2), float(random.uniform(-4.0, 4.0))
+        middle = origin + (AHEAD - 0.5) * SHAPE[0] * SCALE[0] * np.array([np.cos(heading), np.sin(heading)])
+        turns, away = random.uniform(-4.0, 4.0, (2, 20)), random.uniform(35.0, 55.0, 20)
+        places = middle + away[:, None] * np.stack([np.cos(away), np.sin(away)], -1)
+        corners = box_corners(places, turns[0], random.uniform(1.0, 12.0, (20, 2)))
+        frame = Frame(VIEW, origin, heading)
+        near = frame.near(places, np.hypot(*(corners[:, 0] - places).T))
+        pictures = np.zeros((2, *SHAPE), dtype=np.uint8)
+        for picture, shapes in zip(pictures, (corners, corners[near]), strict=True):
+            VIEW.draw([picture] * len(shapes), frame.pixels(shapes), [200] * len(shapes), [False] * len(shapes))
+        assert len(near) < len(places)
+        np.testing.assert_array_equal(pictures[0], pictures[1])
