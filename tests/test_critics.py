@@ -6,14 +6,13 @@ import pytest
 import torch as th
 
 from sb3_esad.common.critics import MIN_VARIANCE, CostCritic, CostTargets, QEnsemble
+from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns
 from sb3_esad.common.target_networks import make_target, update_target
 from sb3_esad.common.torch_layers import GridReadout
 from sb3_esad.common.type_aliases import Imagination, Predictions
 from sb3_esad.esad_lend.targets import (
     Transitions,
     cost_targets,
-    imagined_costs,
-    imagined_returns,
     recorded_cost_targets,
     recorded_return_targets,
 )

@@ -196,6 +196,7 @@ def test_lane_frame_and_ego_frame() -> None:
         env = make(config={"frame": frame})
         env.reset(seed=0)
         env.traffic = Traffic(env.road, [User((50.0, 4.0), 0.2, 25.0, drives=False)])
+        env._note_heading()
         images[frame] = env.observation.observe(env)
     rows = {frame: image[0].astype(float).std(0).mean() for frame, image in images.items()}
     assert rows["lane"] < rows["ego"], "along its columns a road aligned with the lane changes little"

@@ -48,11 +48,18 @@ def crowd(seed: int, count: int = 24) -> list[dict[str, float]]:
     return cars
 
 
+class Stock(IDMVehicle):
+    """As highway-env has it, before one of its environments has changed the class for all others."""
+
+    COMFORT_ACC_MAX, COMFORT_ACC_MIN = 3.0, -5.0
+    DISTANCE_WANTED, TIME_WANTED = 10.0, 1.5
+
+
 def drive_stock(cars: list[dict[str, float]], steps: int) -> tuple[np.ndarray, int]:
     """Final positions in highway-env, and how often a car was seen changing lane."""
     road = StockRoad(network=RoadNetwork.straight_road_network(LANES, speed_limit=30.0))
     for car in cars:
-        vehicle = IDMVehicle(road, [car["x"], 4.0 * car["lane"]], 0.0, car["speed"], target_speed=car["target"])
+        vehicle = Stock(road, [car["x"], 4.0 * car["lane"]], 0.0, car["speed"], target_speed=car["target"])
         vehicle.DELTA = car["exponent"]
         vehicle.check_collisions = False
         road.vehicles.append(vehicle)

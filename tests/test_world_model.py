@@ -225,7 +225,7 @@ def test_a_head_can_infer_again_from_what_its_loss_is_given(monkeypatch: pytest.
 
     monkeypatch.setattr(head, "loss", catch)
     model.loss(make_samples(IMAGE, [[1, 0, 0, 1, 0], [0, 0, 1, 0, 0]]))
-    posterior, prior, memory, embedding = caught
+    posterior, prior, memory, embedding, _ = caught
     again = head.posterior(memory.flatten(0, 1), embedding.flatten(0, 1))
     th.testing.assert_close(again.mean, posterior.mean.flatten(0, 1))
     th.testing.assert_close(head.prior(memory.flatten(0, 1)).std, prior.std.flatten(0, 1))
@@ -243,11 +243,22 @@ class Oracle(LatentHead):
     def posterior(self, memory: th.Tensor, embedding: th.Tensor) -> Gaussian:
         return Gaussian(embedding, th.full_like(embedding, 1e-6))
 
-    def sample(self, memory: th.Tensor, embedding: th.Tensor | None = None, n_candidates: int = 1) -> th.Tensor:
+    def sample(
+        self,
+        memory: th.Tensor,
+        embedding: th.Tensor | None = None,
+        n_candidates: int = 1,
+        generator: th.Generator | None = None,
+    ) -> th.Tensor:
         return th.zeros_like(memory)
 
     def loss(
-        self, posterior: Gaussian, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor
+        self,
+        posterior: Gaussian,
+        prior: Gaussian,
+        memory: th.Tensor,
+        embedding: th.Tensor,
+        generator: th.Generator | None = None,
     ) -> tuple[th.Tensor, dict[str, float]]:
         return th.zeros(()), {}
 
