@@ -56,7 +56,7 @@ class RoadUsers:
         self.velocity = self.speed[:, None] * self.direction
         self.corners = placed(self._outline, self.position, self.direction)
         soon = (self.position + INTENTION_HORIZON * self.velocity).take(self.outsiders, axis=0)
-        along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))
+        along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))  # the last four are corners
         aside, overshoot = np.abs(across), road.overshoot(along)
         self.along, self.across = along[:, :count], across[:, :count]
         self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)
