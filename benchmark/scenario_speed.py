@@ -32,7 +32,7 @@ def rival(env_id: str, scenario: Scenario) -> tuple[str, gym.Env[Any, Any]]:
     Make the stock environment that is most like a scenario, with as many vehicles and lanes as it has now.
 
     For the junction that is ``intersection-v1``; it has a few vehicles less, for who has crossed leaves. For all others it is
-    ``highway-fast-v0``, the fastest of all, where nobody leaves and only the agent can crash: stock roundabouts take no
+    ``highway-fast-v0``, which is made for speed: nobody leaves, and only the agent can crash. Stock roundabouts take no
     continuous actions, and the stock junction has no room for as many vehicles as a town.
 
     :param env_id: of the scenario
