@@ -51,6 +51,7 @@ class RoadUsers:
         self.target_lane[:] = self.lane
 
     def _locate(self) -> None:
+        """Find out, from positions, headings and speeds, where everybody is, and who is how far ahead of whom (``gap``)."""
         road, count = self.road, len(self.speed)
         self.direction = directions(self.heading)
         self.velocity = self.speed[:, None] * self.direction
