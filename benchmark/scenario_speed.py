@@ -11,9 +11,9 @@ import numpy as np
 import sb3_esad.envs  # noqa: F401  (registers ours)
 from sb3_esad.envs.scenario import Scenario, scenario_of
 
-SITUATIONS = ("highway", "traffic-negotiation", "obstacle-avoidance", "braking")
-TOWNS = ("town03", "town04", "town06", "town07", "town10")
-ROADS = [f"esad-{name}-v0" for name in (*SITUATIONS, *TOWNS)]
+JUNCTION = "esad-traffic-negotiation-v0"
+OTHERS = ("highway", "obstacle-avoidance", "braking", "town03", "town04", "town06", "town07", "town10")
+ROADS = [*(f"esad-{name}-v0" for name in OTHERS), JUNCTION]  # last, for intersection-v1 changes stock's cars for all others
 STRAIGHT_ON = np.zeros(2, dtype=np.float32)
 RESETS = 50
 IMAGE = {"type": "GrayscaleObservation", "observation_shape": (64, 64), "stack_size": 1, "weights": [0.2989, 0.587, 0.114]}
@@ -32,7 +32,7 @@ def rival(env_id: str, scenario: Scenario) -> tuple[str, gym.Env[Any, Any]]:
     Make the stock environment that is most like a scenario, with as many vehicles and lanes as it has now.
 
     For the junction that is ``intersection-v1``; it has a few vehicles less, for who has crossed leaves. For all others it is
-    ``highway-fast-v0``, the fastest of all, where nobody leaves and only the agent can crash: stock roundabouts take no
+    ``highway-fast-v0``, which is made for speed: nobody leaves, and only the agent can crash. Stock roundabouts take no
     continuous actions, and the stock junction has no room for as many vehicles as a town.
 
     :param env_id: of the scenario
@@ -40,7 +40,7 @@ def rival(env_id: str, scenario: Scenario) -> tuple[str, gym.Env[Any, Any]]:
     :return: its id, and the environment
     """
     drivers = len(scenario.traffic.drivers)
-    if env_id == "esad-traffic-negotiation-v0":
+    if env_id == JUNCTION:
         name, config = "intersection-v1", {"initial_vehicle_count": drivers, "spawn_probability": 1.0}
     else:
         name, config = "highway-fast-v0", {"vehicles_count": drivers, "lanes_count": getattr(scenario, "lanes", 3)}

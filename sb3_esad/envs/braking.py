@@ -79,8 +79,8 @@ class Braking(StraightDrive):
 
     def _car_ahead(self) -> int:
         front = int(self.traffic.front[EGO])
-        drives = front >= 0 and bool(self.traffic.drives[front])
-        return front if drives and self._distance(front) < NEAR else -1
+        near = front >= 0 and self.traffic.drives[front] and self._distance(front) < NEAR
+        return front if near else -1
 
     def _car_beside(self) -> int:
         """A car in a lane beside the ego vehicle's, a little ahead, with nobody between them; -1 if there is none."""

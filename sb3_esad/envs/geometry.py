@@ -21,7 +21,9 @@ def wrap_angle(angle: AnyFloat) -> AnyFloat:
     :return: the same directions, in [-pi, pi)
     """
     turned = angle + math.pi
-    return turned - math.tau * np.floor(turned / math.tau) - math.pi  # several times faster than %
+    turned -= math.tau * np.floor(turned / math.tau)  # several times faster than %
+    turned -= math.pi
+    return turned
 
 
 def bounded(value: NDArray[FloatKind], limit: float) -> NDArray[FloatKind]:
@@ -42,7 +44,19 @@ def directions(heading: Floats) -> Floats:
     :param heading: shape ``(n,)`` [rad]
     :return: shape ``(n, 2)``
     """
-    return np.array([np.cos(heading), np.sin(heading)]).T.copy()
+    return np.array([np.cos(heading), np.sin(heading)]).T.copy()  # as np.stack would lay it out, in less time
+
+
+def in_frame(offset: Floats, direction: Floats) -> tuple[Floats, Floats]:
+    """
+    See points as a vehicle does, or each of n vehicles.
+
+    :param offset: from its centre, along x and y, shape ``(2, ...)``, the last dimension being n if they are several [m]
+    :param direction: of the vehicle, a unit vector, shape ``(2,)``, or of each, ``(n, 2)``
+    :return: how far the points are ahead of it and to its right, each of the shape of ``offset[0]`` [m]
+    """
+    (x, y), (cos, sin) = offset, direction.T
+    return x * cos + y * sin, y * cos - x * sin
 
 
 def outlines(size: Floats) -> Floats:

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats, box_distances, boxes_overlap
+from sb3_esad.envs.geometry import Floats, box_distances, boxes_overlap, in_frame
 from sb3_esad.envs.road_users import EGO
 from sb3_esad.envs.roads import Ints, Road
 from sb3_esad.envs.traffic import Traffic
@@ -71,8 +71,7 @@ def time_to_collision(traffic: Traffic | Bodies) -> float:
     :param traffic: all road users
     :return: infinite if nothing in the path is being approached [s]
     """
-    (x, y), (cos, sin) = (traffic.position - traffic.position[EGO]).T, traffic.direction[EGO]
-    ahead, across = x * cos + y * sin, y * cos - x * sin
+    ahead, across = in_frame((traffic.position - traffic.position[EGO]).T, traffic.direction[EGO])
     closing = traffic.speed[EGO] - traffic.velocity @ traffic.direction[EGO]
     beside = (traffic.size[:, 1] + traffic.size[EGO, 1]) / 2
     rows = ((np.abs(across) < beside) & (ahead > 0) & (closing > 0)).nonzero()[0]

@@ -106,7 +106,7 @@ class Highway(StraightDrive):
         """Now and then the car ahead slows down sharply for some seconds, then drives on."""
         traffic, waited = self.traffic, self.episode.time - self._slowdown_start
         front = int(traffic.front[EGO])
-        if self._slowed is None and waited >= 0 and front in traffic.drivers:
+        if self._slowed is None and waited >= 0 and front >= 0 and traffic.drives[front]:
             self._slowed = (front, float(traffic.target_speed[front]))
             self._slowdown_start = self.episode.time
             traffic.target_speed[front] = self.config["slowdown_speed"]

@@ -40,18 +40,19 @@ class TrafficLights:
     """
 
     def __init__(self, road: Road, ways: Sequence[Way], offsets: Floats) -> None:
-        self._source = np.array([way.source for way in ways])
-        heading = road.heading[self._source] + road.curvature[self._source] * road.length[self._source]
-        self._across = np.abs(np.sin(heading)) > np.abs(np.cos(heading))
+        source = np.array([way.source for way in ways])
+        heading = road.heading_at(source, road.length[source])
+        across = np.abs(np.sin(heading)) > np.abs(np.cos(heading))
+        self._delay = np.where(across, PERIOD / 2, 0.0)
         self._ahead = offsets[np.array([way.junction for way in ways]) - 1]
-        lines, self._line_of = np.unique(self._source, return_inverse=True)
-        ends = np.array([road.position(lane, road.length[lane] - SETBACK) for lane in lines])
-        size = np.tile([LINE_DEPTH, road.width[0]], (len(lines), 1))
-        self._lines = box_corners(ends, heading[np.unique(self._line_of, return_index=True)[1]], size)
+        lanes, self._first_way = np.unique(source, return_index=True)  # all ways from a lane turn green together
+        ends = np.array([road.position(lane, road.length[lane] - SETBACK) for lane in lanes])
+        size = np.tile([LINE_DEPTH, road.width[0]], (len(lanes), 1))
+        self._lines = box_corners(ends, heading[self._first_way], size)
 
     def _phase(self, time: float) -> Floats:
         """Time since each way's light turned green [s]."""
-        return np.asarray((time + self._ahead - np.where(self._across, PERIOD / 2, 0.0)) % PERIOD)
+        return np.asarray((time + self._ahead - self._delay) % PERIOD)
 
     def closed(self, time: float) -> Bools:
         """
@@ -78,5 +79,5 @@ class TrafficLights:
         :param time: since the start [s]
         :return: the lines before all lights that are not green
         """
-        lines, first = np.unique(self._line_of[self.closed(time)], return_index=True)
-        return StopLines(self._lines[lines], self.red(time)[self.closed(time)][first])
+        closed = self.closed(time)[self._first_way]
+        return StopLines(self._lines[closed], self.red(time)[self._first_way][closed])

@@ -12,6 +12,7 @@ from sb3_esad.envs.users import User
 
 OFF_PATH = 1.5  # where lanes overlap, one is on that of one's path even if another is as much nearer [m]
 LOOKAHEAD = 3  # lanes that are looked into beyond the present one
+_NONE = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)
 
 
 class Outlook(NamedTuple):
@@ -53,7 +54,8 @@ class Paths:
         for row, user in enumerate(users):
             if user.path:
                 self._read(road, row, user.path)
-        self.any_leads_astray, self._any_goes_on = self.leads_astray.any(), (self.next_lane != NO_LANE).any()
+        self.any_leads_astray = bool(self.leads_astray.any())
+        self._any_goes_on = bool((self.next_lane != NO_LANE).any())
         self._further, self._starts = self._foresee(road)
 
     def _read(self, road: Road, row: int, path: Sequence[int]) -> None:
@@ -91,10 +93,7 @@ class Paths:
         :return: these lanes and those after them
         """
         if not self._any_goes_on:
-            return Outlook(rows, lanes, *NOTHING)
+            return Outlook(rows, lanes, *_NONE)
         further = self._further[rows, lanes]
         order, step = (further != NO_LANE).nonzero()
         return Outlook(rows, lanes, order, further[order, step], self._starts[rows[order], lanes[order], step])
-
-
-NOTHING = np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.int64), np.zeros(0)

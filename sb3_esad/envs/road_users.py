@@ -51,12 +51,13 @@ class RoadUsers:
         self.target_lane[:] = self.lane
 
     def _locate(self) -> None:
+        """Find out, from positions, headings and speeds, where everybody is, and who is how far ahead of whom (``gap``)."""
         road, count = self.road, len(self.speed)
         self.direction = directions(self.heading)
         self.velocity = self.speed[:, None] * self.direction
         self.corners = placed(self._outline, self.position, self.direction)
         soon = (self.position + INTENTION_HORIZON * self.velocity).take(self.outsiders, axis=0)
-        along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))
+        along, across = road.project(np.concatenate([self.position, soon, self.corners[EGO]]))  # the last four are corners
         aside, overshoot = np.abs(across), road.overshoot(along)
         self.along, self.across = along[:, :count], across[:, :count]
         self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)

@@ -59,7 +59,7 @@ class Road:
         self.heading = np.array([lane.heading for lane in lanes], dtype=np.float64)
         self.length = np.array([lane.length for lane in lanes], dtype=np.float64)
         self.curvature = np.array([lane.curvature for lane in lanes], dtype=np.float64)
-        self._origin, self._along = self.start.T[:, :, None].copy(), directions(self.heading).T[:, :, None]
+        self._origin, self._direction = self.start.T[:, :, None].copy(), directions(self.heading).T[:, :, None]
         self.width = np.array([lane.width for lane in lanes])
         self._half_width = self.width[:, None] / 2
         self.speed_limit = np.array([lane.speed_limit for lane in lanes])
@@ -88,7 +88,7 @@ class Road:
         :return: distance along the lane from its start, and to the right of its centre, each ``(lanes, n)`` [m]
         """
         offset = position.T[:, None] - self._origin
-        (x_cos, y_sin), (y_cos, x_sin) = offset * self._along, offset[::-1] * self._along
+        (x_cos, y_sin), (y_cos, x_sin) = offset * self._direction, offset[::-1] * self._direction
         along, across = x_cos + y_sin, y_cos - x_sin
         if self.arcs.size:
             along[self.arcs], across[self.arcs] = self._project_onto_arcs(position)
@@ -193,7 +193,10 @@ class Road:
         turn = heading - self.heading[:, None]
         if self.arcs.size:
             turn -= self.curvature[:, None] * along
-        return np.asarray((distance + np.abs(wrap_angle(turn)) + handicap).argmin(0))
+        total = np.abs(wrap_angle(turn))
+        total += distance
+        total += handicap
+        return np.asarray(total.argmin(0))
 
     def covers(self, aside: Floats, overshoot: Floats) -> Bools:
         """

@@ -205,7 +205,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.episode.add_motion(duration, metres, self._progress(), on_route)
 
     def _note_heading(self) -> None:
-        """Set the angle from the lane to the ego vehicle, within [-pi, pi) [rad]."""
+        """Note the angle from the lane to the ego vehicle, within [-pi, pi) [rad], and whether that is the wrong direction."""
         traffic, lane = self.traffic, int(self.traffic.lane[EGO])
         along_lane = self.road.lanes[lane].heading_at(float(traffic.along[lane, EGO]))
         self.heading_error = float(wrap_angle(float(traffic.heading[EGO]) - along_lane))

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats
+from sb3_esad.envs.geometry import Floats, directions, in_frame
 from sb3_esad.envs.roads import Bools, Ints
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind, User
@@ -67,21 +67,13 @@ class Walkers:
     def _must_wait(self, traffic: Traffic, rows: Ints) -> Bools:
         """Nobody walks into a car, nor right in front of one; who is in front of one already walks on."""
         cars = np.flatnonzero(traffic.is_vehicle)
-        stands, heading = traffic.speed[cars] < 0.1, traffic.heading[rows]
-        step = (
-            np.where(stands, LOOK_NEAR_STANDING * self._speed, LOOK)[:, None]
-            * np.stack([np.cos(heading), np.sin(heading)], -1)[:, None]
-        )
-        here = traffic.position[rows][:, None] - traffic.position[cars]
-        (along, across), (_, across_now) = _in_frame_of(traffic, cars, here + step), _in_frame_of(traffic, cars, here)
+        stands, speed, direction = traffic.speed[cars] < 0.1, traffic.speed[cars], traffic.direction[cars]
+        look = np.where(stands, LOOK_NEAR_STANDING * self._speed, LOOK)
+        here = traffic.position[rows].T[..., None] - traffic.position[cars].T[:, None]
+        along, across = in_frame(here + look * directions(traffic.heading[rows]).T[..., None], direction)
+        _, across_now = in_frame(here, direction)
         length, width = traffic.size[cars].T / 2 + np.where(stands, BERTH_OF_STANDING, BERTH)
-        touches = (np.abs(along) < length) & (np.abs(across) < width)
-        steps_in_front = (along > 0) & (along < length + self._caution * traffic.speed[cars])
-        steps_in_front &= (np.abs(across) < width) & (np.abs(across_now) >= width)
+        beside, ahead = np.abs(across) < width, along > 0
+        touches = (np.abs(along) < length) & beside
+        steps_in_front = ahead & (along < length + self._caution * speed) & beside & (np.abs(across_now) >= width)
         return np.asarray((touches | steps_in_front).any(1))
-
-
-def _in_frame_of(traffic: Traffic, cars: Ints, offset: Floats) -> tuple[Floats, Floats]:
-    """Places ahead of and to the right of cars, ``offset`` of shape ``(n, cars, 2)`` being their distance from these [m]."""
-    cos, sin = traffic.direction[cars].T
-    return offset[..., 0] * cos + offset[..., 1] * sin, offset[..., 1] * cos - offset[..., 0] * sin
