@@ -1,6 +1,7 @@
 """The last word on the action: a filter whose judgement is known, and the drive that it changes."""
 
 import math
+import pickle
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from sb3_esad.common.foresight import Foresight, Outlook
 from sb3_esad.common.functional import barrier_residual
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.penalties import NoPenalty
-from sb3_esad.common.selection import ActionFilter, NoFilter, SafetyFilter, Selection
+from sb3_esad.common.selection import ActionFilter, NoFilter, SafetyFilter, Selection, SelectionRates
 from sb3_esad.common.type_aliases import Belief, LatentState
 from tests.conftest import TINY, CountingEnv
 
@@ -150,7 +151,7 @@ class Obstinate(ESADLEND):
 
 
 def test_what_is_executed_is_stored_remembered_and_counted() -> None:
-    model = Obstinate("MlpPolicy", CountingEnv(), **TINY).learn(30)
+    model = Obstinate("MlpPolicy", CountingEnv(), **TINY, filter_start=0).learn(30)
     actions = model.replay_buffer.actions[:30, 0, 0]
     assert (actions[:20] != 0.25).all() and (actions[20:] == 0.25).all()
     assert model._last_latent is not None and (model._last_latent.action == 0.25).all()
@@ -161,9 +162,9 @@ def test_what_is_executed_is_stored_remembered_and_counted() -> None:
 
 def test_nothing_is_filtered_without_a_limit_or_a_filter() -> None:
     for model in (
-        ESADLEND("MlpPolicy", CountingEnv(), **TINY, cost_limit=None),
-        ESADLEND("MlpPolicy", CountingEnv(), **TINY, filter_start=None),
-        ADEND("MlpPolicy", CountingEnv(), **TINY),
+        ESADLEND("MlpPolicy", CountingEnv(), **TINY, cost_limit=None, filter_start=0),
+        ESADLEND("MlpPolicy", CountingEnv(), **TINY),
+        ADEND("MlpPolicy", CountingEnv(), **TINY, filter_start=0),
     ):
         assert isinstance(model.policy.action_filter, NoFilter)
 
@@ -192,3 +193,14 @@ def test_predictions_by_a_filter_are_the_same_again_and_after_loading(tmp_path: 
     agent, starts = model.policy.average, th.ones(5, dtype=th.bool)
     seen = agent.observe(th.as_tensor(observations), model.policy.initial_state(5), starts, True)
     assert not np.allclose(first, agent.act(seen.state, True).numpy()), "the filter has not intervened"
+
+
+def test_rates_are_shares_of_all_actions_and_take_no_more_room_the_longer_they_are_noted() -> None:
+    rates, sizes = SelectionRates(), []
+    intervened, helpless = th.tensor([True, True, False, False]), th.tensor([True, False, False, False])
+    for _ in range(2):
+        for _ in range(100):
+            rates.note(Selection(th.zeros(4, 1), intervened, helpless))
+        sizes.append(len(pickle.dumps(rates)))
+    assert sizes[0] == sizes[1]
+    assert rates.take() == {"intervention_rate": 0.5, "fallback_rate": 0.25}

@@ -38,7 +38,7 @@ class SelectionRates:
     """How often actions have been replaced lately."""
 
     def __init__(self) -> None:
-        self._selections: list[Selection] = []
+        self._n_actions, self._counts = 0, th.zeros(2)
 
     def note(self, selection: Selection) -> None:
         """
@@ -46,7 +46,8 @@ class SelectionRates:
 
         :param selection: of that step
         """
-        self._selections.append(selection)
+        self._n_actions += len(selection.actions)
+        self._counts = self._counts.to(selection.actions.device) + th.stack([selection.intervened, selection.helpless]).sum(1)
 
     def take(self) -> Logs:
         """
@@ -54,14 +55,10 @@ class SelectionRates:
 
         :return: shares of the actions, empty if there were none
         """
-        selections, self._selections = self._selections, []
-        if not selections:
-            return {}
-        rates = {
-            "intervention_rate": [each.intervened for each in selections],
-            "fallback_rate": [each.helpless for each in selections],
-        }
-        return {name: th.cat(flags).float().mean().item() for name, flags in rates.items()}
+        n_actions, counts = self._n_actions, self._counts.tolist()
+        self._n_actions, self._counts = 0, th.zeros(2)
+        names = ("intervention_rate", "fallback_rate")
+        return {name: count / n_actions for name, count in zip(names, counts, strict=True)} if n_actions else {}
 
 
 def draw_scenarios(agent: LatentAgent, belief: Belief, n: int) -> LatentState:
