@@ -147,10 +147,10 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
     ) -> tuple[np.ndarray, np.ndarray]:
         belief = self._take_in_last_observation(n_envs)
         warm_up = self.num_timesteps < learning_starts
-        scaled = self._held_random_actions(n_envs) if warm_up else self.policy.learner.act(belief.state).cpu().numpy()
+        actions = self._held_random_actions(n_envs) if warm_up else self.policy.learner.act(belief.state)
         if action_noise is not None:
-            scaled = np.clip(scaled + np.reshape(action_noise(), scaled.shape), -1, 1).astype(np.float32)
-        actions = th.as_tensor(scaled, device=self.device)
+            noise = th.as_tensor(action_noise(), dtype=actions.dtype, device=actions.device)
+            actions = (actions + noise.view_as(actions)).clamp(-1, 1)
         # The memory must hold the action that is executed, or it would learn from a world that did not happen
         executed = actions if warm_up else self._select(belief, actions)
         self._last_latent = belief.state._replace(action=executed)
@@ -170,13 +170,13 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
         episode_start = th.as_tensor(starts, device=self.device)
         return self.policy.learner.observe(observation, self._last_latent, episode_start, False)
 
-    def _held_random_actions(self, n_envs: int) -> np.ndarray:
+    def _held_random_actions(self, n_envs: int) -> th.Tensor:
         if self._random_actions is None or (self.num_timesteps // n_envs) % self.random_hold == 0:
             actions = np.stack([self.action_space.sample() for _ in range(n_envs)])
             scaled = self.policy.scale_action(actions).reshape(n_envs, -1)
             # With a random amplitude: full strokes alone would end every episode within seconds and show little of the world
             self._random_actions = (np.random.rand(n_envs, 1) * scaled).astype(np.float32)
-        return self._random_actions
+        return th.as_tensor(self._random_actions, device=self.device)
 
     def _excluded_save_params(self) -> list[str]:
         return [*super()._excluded_save_params(), "_last_latent", "_random_actions"]
