@@ -20,6 +20,7 @@ from sb3_esad.common.diffusion import DiffusionHead
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.type_aliases import LatentState, SequenceSamples
 from sb3_esad.common.world_model import WorldModel
+from sb3_esad.envs.intervals import mean_interval
 
 HORIZON, STARTS = 5, (5, 12, 20)
 N_SAMPLES = 16
@@ -75,14 +76,12 @@ def scores(model: WorldModel, samples: SequenceSamples, start: int) -> np.ndarra
 
 def interval(differences: np.ndarray) -> str:
     """
-    Mean with its bootstrap interval.
+    Mean with its interval.
 
     :param differences: of pairs, of shape (N,)
     :return: words
     """
-    random = np.random.default_rng(0)
-    means = [random.choice(differences, len(differences)).mean() for _ in range(2000)]
-    low, high = np.percentile(means, [2.5, 97.5])
+    low, high = mean_interval(differences)
     return f"{differences.mean():+.4f} [{low:+.4f}, {high:+.4f}]"
 
 
@@ -116,7 +115,8 @@ def main() -> None:
     th.set_num_threads(args.threads)
     env = gym.make(args.env)
     for seed in args.seeds:
-        algorithm = ESADLEND("CnnPolicy", env, buffer_size=1000, seed=seed)
+        kwargs = {"head_kwargs": {"diffusion_steps": 2}}
+        algorithm = ESADLEND("CnnPolicy", env, buffer_size=1000, policy_kwargs=kwargs, seed=seed)
         algorithm.replay_buffer = record(env, args.steps, seed, 16)
         updates = fit(algorithm, args.seconds)
         others = record(env, 5000, 1000 + seed, 32)

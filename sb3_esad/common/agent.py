@@ -1,4 +1,4 @@
-"""How the networks drive together: take in an observation, propose an action, foresee where it leads."""
+"""The networks as they drive together: take in an observation, propose an action."""
 
 from typing import NamedTuple
 

@@ -47,7 +47,7 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
         barrier_decay: float = 0.3,
         barrier_steps: int = 2,
         barrier_coef: float = 0.0,
-        filter_start: int | None = 2000,
+        filter_start: int | None = None,
         n_candidates: int = 8,
         n_proposals: int = 16,
         _init_setup_model: bool = True,

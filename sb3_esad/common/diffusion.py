@@ -52,7 +52,7 @@ class DiffusionHead(GaussianHead):
     than few steps from pure noise (truncated diffusion). It is learned beside the Gaussians, which never see its gradient.
 
     Until the denoiser foresees residuals better than the Gaussian's own optimal denoiser, the head samples as a
-    :class:`GaussianHead`; with 0 steps it is one.
+    :class:`GaussianHead`; with 0 steps, the default until more has been shown to help, it is one.
 
     :param memory_shape: shape of the memory (C, H, W)
     :param embedding_channels: channels of the observation's features
@@ -74,7 +74,7 @@ class DiffusionHead(GaussianHead):
         embedding_channels: int,
         latent_channels: int,
         hidden_channels: int,
-        diffusion_steps: int = 2,
+        diffusion_steps: int = 0,
         start_level: float = 3.0,
         **kwargs: Any,
     ) -> None:
@@ -104,24 +104,31 @@ class DiffusionHead(GaussianHead):
     ) -> th.Tensor:
         if not self.refines:
             return super().sample(memory, embedding, n_candidates, generator)
-        prior = self.prior(memory)
-        context = self.denoiser.context(memory, embedding)
-        start = self.residual_scale * (self.start_level if embedding is None else 1.0)
-        centre, variance = th.zeros_like(prior.mean), (prior.std.square() - self.posterior_std.square()).clamp(min=0)
-        if embedding is not None:
-            centre, variance = self.posterior(memory, embedding).mean - prior.mean, th.zeros_like(centre)
-        fields = (prior.mean, context, centre, (variance + start**2).sqrt())
+        prior, context = self.prior(memory), self.denoiser.context(memory, embedding)
+        level = self.residual_scale * (self.start_level if embedding is None else 1.0)
+        fields = (prior.mean, context, *self._noised(prior, memory, embedding, level))
         mean, context, centre, spread = (th.cat([field] * n_candidates) for field in fields)
-        return mean + self._refine(Gaussian(centre, spread).sample(generator), context, start, generator)
+        return mean + self._refine(Gaussian(centre, spread).sample(generator), context, level, generator)
+
+    def _noised(self, prior: Gaussian, memory: th.Tensor, embedding: th.Tensor | None, level: th.Tensor) -> Gaussian:
+        """What is known of the residual without the denoiser, noised: the Gaussian prior's spread, or the posterior's mean."""
+        if embedding is None:
+            return Gaussian(th.zeros_like(prior.mean), (self._residual_variance(prior) + level**2).sqrt())
+        residual = self.posterior(memory, embedding).mean - prior.mean
+        return Gaussian(residual, level.expand_as(residual))
+
+    def _residual_variance(self, prior: Gaussian) -> th.Tensor:
+        """Variance of the posterior's mean given the memory, as far as the Gaussians tell."""
+        return (prior.std.square() - self.posterior_std.square()).clamp(min=0)
 
     def _refine(self, noisy: th.Tensor, context: th.Tensor, start: th.Tensor, generator: th.Generator | None) -> th.Tensor:
         """Euler's steps from one noise level to the next; the last one ends at the spread of the posterior."""
         levels = noise_levels(start, self.diffusion_steps)
         for level, following in zip(levels, [*levels[1:], self.posterior_std], strict=True):
             clean = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
-            end = th.minimum(following, level)
-            noisy = clean + end / level * (noisy - clean)
-        missing = (self.posterior_std.square() - end.square()).sqrt()  # where latents are vaguer than where the sample began
+            noisy = clean + (following / level).clamp(max=1) * (noisy - clean)
+        # Where latents are vaguer than where the last step began
+        missing = (self.posterior_std.square() - levels[-1].square()).clamp(min=0).sqrt()
         return Gaussian(noisy, missing).sample(generator)
 
     def loss(
@@ -166,12 +173,11 @@ class DiffusionHead(GaussianHead):
 
     @th.no_grad()
     def _judge(self, prior: Gaussian, residual: th.Tensor, memory: th.Tensor, generator: th.Generator | None) -> None:
-        """Compare the denoiser with the Gaussian's own where samples start, on states that it has not been fitted to yet."""
+        """Compare the denoiser with the Gaussian's own where samples start, before it is fitted to these states."""
         level = self.residual_scale * self.start_level
         noisy = Gaussian(residual, level.expand_as(residual)).sample(generator)
         context = self.denoiser.context(memory, None)
         learned = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
-        variance = (prior.std.square() - self.posterior_std.square()).clamp(min=0)
-        assumed = gaussian_denoiser(noisy, level, variance)
+        assumed = gaussian_denoiser(noisy, level, self._residual_variance(prior))
         errors = [(estimate - residual).square().mean() for estimate in (learned, assumed)]
         self.advantage.lerp_(1 - errors[0] / errors[1], 1 - MEMORY)
