@@ -64,12 +64,6 @@ def diffusion(steps: int) -> dict[str, Any]:
 FILTER = {"filter_start": 500}
 FULL = {**diffusion(2), **FILTER, "barrier_coef": 1.0}
 EXPERIMENTS = {
-    "E3": Experiment(
-        "How fast may the multiplier move?",
-        (HIGHWAY,),
-        15_000,
-        {f"lambda_lr {rate}": Arm("esad_lend", {"lambda_lr": rate}) for rate in (0.01, 0.003, 0.03)},
-    ),
     "E4": Experiment(
         "How many steps of diffusion?",
         (HIGHWAY, "esad-traffic-negotiation-v0"),

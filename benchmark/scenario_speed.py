@@ -14,6 +14,7 @@ from sb3_esad.envs.scenario import Scenario, scenario_of
 JUNCTION = "esad-traffic-negotiation-v0"
 OTHERS = ("highway", "obstacle-avoidance", "braking", "town03", "town04", "town06", "town07", "town10")
 ROADS = [*(f"esad-{name}-v0" for name in OTHERS), JUNCTION]  # last, for intersection-v1 changes stock's cars for all others
+COURSES = [f"esad-course{walkers}-v0" for walkers in ("", "-1mps", "-2mps", "-3mps")]
 STRAIGHT_ON = np.zeros(2, dtype=np.float32)
 RESETS = 50
 IMAGE = {"type": "GrayscaleObservation", "observation_shape": (64, 64), "stack_size": 1, "weights": [0.2989, 0.587, 0.114]}
@@ -116,16 +117,32 @@ def compare(env_id: str, episodes: int, repeats: int, steps: int) -> None:
     )
 
 
+def alone(env_id: str, episodes: int, repeats: int, steps: int) -> None:
+    """
+    Time a scenario that is like nothing in stock.
+
+    :param env_id: scenario
+    :param episodes: how many starts
+    :param repeats: of each of them
+    :param steps: each time
+    """
+    env = gym.make(env_id)
+    best = [min(drive(env, seed, steps)[0] for _ in range(repeats)) for seed in range(episodes)]
+    reset = np.median([reset_time(env, seed) for seed in range(RESETS)])
+    print(f"{env_id:28s}{1 / np.mean(best):5.0f} steps/s; reset {1000 * reset:3.1f} ms", flush=True)
+
+
 def main() -> None:
-    """Compare every scenario that has roads."""
+    """Compare every scenario that has roads, and time the others."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--episodes", type=int, default=8)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--steps", type=int, default=50)
-    parser.add_argument("--envs", nargs="+", default=ROADS)
+    parser.add_argument("--envs", nargs="+", default=[*COURSES, *ROADS])
     args = parser.parse_args()
     for env_id in args.envs:
-        compare(env_id, args.episodes, args.repeats, args.steps)
+        measure = alone if env_id in COURSES else compare
+        measure(env_id, args.episodes, args.repeats, args.steps)
 
 
 if __name__ == "__main__":

@@ -48,7 +48,7 @@ class Step(NamedTuple):
 
 def steps(env: gym.Env[Any, Any], seed: int) -> Iterator[Step]:
     """
-    Drive with scripted drivers of all tempers, among them some that wander: they crash about 50 times in 5,000 steps.
+    Drive with scripted drivers of all tempers, among them some that do as they please, so that there are crashes enough.
 
     :param env: scenario
     :param seed: of scenario and drivers
