@@ -7,13 +7,15 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_esad.common.selection import Selection
+from sb3_esad.common.selection import NoFilter
 from sb3_esad.dream import DreamingDriver
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.explanation import ExplainedDriver
-from sb3_esad.panels import BAD, GOOD, MARK, Colour, Gauge, Picture, compose, paint
+from sb3_esad.panels import BAD, FAINT, GOOD, MARK, Colour, Gauge, Picture, compose, paint
 
 SMALLEST_RISK = 1e-4
+DREAM = "A dream goes on from memory, given the actions really taken."
+FUTURES = "Futures start from what may be the case now, with the action chosen; the actor goes on in each of them."
 
 
 class Moment(NamedTuple):
@@ -55,7 +57,7 @@ def dreaming_frame(moment: Moment, driver: DreamingDriver) -> Picture:
         _risk(driver.model, "predicted risk", driver.risk()),
         _route(moment),
     ]
-    return compose(render(moment.env), panels, gauges, moment.verdict)
+    return compose(render(moment.env), panels, gauges, moment.verdict, DREAM)
 
 
 def explaining_frame(moment: Moment, driver: ExplainedDriver) -> Picture:
@@ -71,7 +73,8 @@ def explaining_frame(moment: Moment, driver: ExplainedDriver) -> Picture:
         "What it sees": paint(image_of(moment.observation) / 255.0),
         "What it remembers": _picture(driver.reconstruction()),
     }
-    panels["Filter: " + _word(driver.selection)] = np.full((80, 160, 3), _colour(driver.selection), dtype=np.uint8)
+    word, colour = _verdict_of_filter(driver)
+    panels[word] = np.full((80, 160, 3), colour, dtype=np.uint8)
     places = {"most dangerous": 0, "middle": len(futures.costs) // 2, "least dangerous": len(futures.costs) - 1}
     for name, place in places.items():
         title = f"In {ahead:.0f} s, {name} of {len(futures.costs)}: cost {100 * futures.costs[place]:.1f} %"
@@ -82,17 +85,15 @@ def explaining_frame(moment: Moment, driver: ExplainedDriver) -> Picture:
         _risk(driver.model, "mean of the futures", futures.costs.mean().item()),
         _risk(driver.model, "worst of them", driver.tail(futures)),
     ]
-    return compose(render(moment.env), panels, gauges, moment.verdict)
+    return compose(render(moment.env), panels, gauges, moment.verdict, FUTURES)
 
 
-def _word(selection: Selection) -> str:
-    if selection.helpless:
-        return "nothing is safe, least risk taken"
-    return "another action taken" if selection.intervened else "the actor's own action"
-
-
-def _colour(selection: Selection) -> Colour:
-    return BAD if selection.helpless else MARK if selection.intervened else GOOD
+def _verdict_of_filter(driver: ExplainedDriver) -> tuple[str, Colour]:
+    if isinstance(driver.model.policy.action_filter, NoFilter):
+        return "It has no filter", FAINT
+    if driver.selection.helpless:
+        return "Filter: nothing is safe, least risk taken", BAD
+    return ("Filter: another action taken", MARK) if driver.selection.intervened else ("Filter: the actor's own action", GOOD)
 
 
 def _speed(moment: Moment) -> Gauge:

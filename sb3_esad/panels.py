@@ -18,9 +18,7 @@ PANEL = (416, 208)
 TITLE = 28
 BACKGROUND, TEXT, FAINT = (24, 26, 30), (235, 235, 235), (150, 152, 158)
 GOOD, BAD, MARK = (64, 200, 110), (235, 80, 60), (255, 210, 60)
-CAPTION = (
-    "Green: the agent. Blue: others, the faster the lighter. A dream goes on from memory, given the actions really taken."
-)
+LEGEND = "Green: the agent. Blue: others, the faster the lighter."
 ROAD_GREYS = (0, bev.OFF_ROUTE_GREY, bev.ROUTE_GREY, bev.DASH_GREY)
 ROAD_COLOURS = np.array([drawing.GRASS, drawing.ASPHALT, drawing.ROUTE, drawing.PAINT])
 
@@ -69,7 +67,7 @@ def _blend(under: object, over: object, share: NDArray[np.floating]) -> NDArray[
     return (1.0 - share) * np.asarray(under) + share * np.asarray(over)
 
 
-def compose(scene: Picture, panels: dict[str, Picture], gauges: list[Gauge], verdict: str) -> Picture:
+def compose(scene: Picture, panels: dict[str, Picture], gauges: list[Gauge], verdict: str, caption: str = "") -> Picture:
     """
     Put everything that belongs to one moment into one picture.
 
@@ -77,6 +75,7 @@ def compose(scene: Picture, panels: dict[str, Picture], gauges: list[Gauge], ver
     :param panels: small pictures by their titles, three in a row
     :param gauges: figures of the moment
     :param verdict: how the episode ended, empty as long as it goes on
+    :param caption: what else the panels mean
     :return: RGB picture, 1280 pixels wide, 624 high with three panels and 880 with six
     """
     size = (WIDTH, HEIGHT + ROW * -(-len(panels) // IN_A_ROW))
@@ -92,7 +91,7 @@ def compose(scene: Picture, panels: dict[str, Picture], gauges: list[Gauge], ver
         canvas.paste(Image.fromarray(enlarged), (left, top + TITLE))
     for index, gauge in enumerate(gauges):
         _draw_gauge(draw, gauge, scene.shape[1] + 24, TITLE + 4 + 82 * index)
-    _write(draw, (8, size[1] - 21), CAPTION, 14, FAINT)
+    _write(draw, (8, size[1] - 21), f"{LEGEND} {caption}", 14, FAINT)
     if verdict:
         _write(draw, (scene.shape[1] // 2, TITLE + scene.shape[0] - 40), verdict, 30, MARK, "mm")
     return np.asarray(canvas)
