@@ -46,7 +46,7 @@ class Denoiser(nn.Module):
         self.embedding_net = same_conv(embedding_channels, channels, 1)
         self.level_net = dense_block(1, channels)
         self.latent_net = same_conv(latent_channels, channels, kernel)
-        self.blocks = nn.Sequential(ResidualBlock(channels), ResidualBlock(channels), ChannelNorm(channels), nn.SiLU())
+        self.blocks = nn.Sequential(ResidualBlock(channels), ChannelNorm(channels), nn.SiLU())
         self.output = same_conv(channels, latent_channels, 1)
         for parameter in self.output.parameters():
             nn.init.zeros_(parameter)
