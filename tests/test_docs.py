@@ -5,8 +5,9 @@ import re
 import runpy
 import shlex
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from configparser import ConfigParser
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -44,19 +45,20 @@ BRIEF = {"learning_starts": 20, "train_freq": 5, "gradient_steps": 1, "pretrain_
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trainings have 25 steps, and an update at their end; models are judged by the first two episodes."""
-    learn, evaluate = OffPolicyAlgorithm.learn, driving_evaluation.evaluate_model
+    """Trainings have 25 steps, and an update at their end; models and drivers are judged by the first two episodes."""
+    learn = OffPolicyAlgorithm.learn
 
     def learn_briefly(self: OffPolicyAlgorithm, total_timesteps: int, *args: Any, **kwargs: Any) -> OffPolicyAlgorithm:
         vars(self).update(BRIEF)
         self._convert_train_freq()
         return learn(self, 25 * self.n_envs, *args, **kwargs)
 
-    def evaluate_briefly(model: OffPolicyAlgorithm, env_id: str, seeds: range) -> list[Any]:
-        return evaluate(model, env_id, seeds[:2])
+    def briefly(evaluate: Callable[..., Any], who: Any, env_id: str, seeds: range) -> Any:
+        return evaluate(who, env_id, seeds[:2])
 
     monkeypatch.setattr(OffPolicyAlgorithm, "learn", learn_briefly)
-    monkeypatch.setattr(driving_evaluation, "evaluate_model", evaluate_briefly)
+    for name in ("evaluate_model", "evaluate_driver"):
+        monkeypatch.setattr(driving_evaluation, name, partial(briefly, getattr(driving_evaluation, name)))
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -123,14 +125,11 @@ def run_python(words: list[str]) -> None:
 
 def run_ours(words: list[str]) -> None:
     """Our own parser hands the words of RL Zoo's commands on to that of RL Zoo."""
-    with mock.patch.object(argparse.ArgumentParser, "parse_args", PARSE_ARGS):
-        args = make_parser().parse_args(words)
+    args, unknown = make_parser().parse_known_args(words)
+    assert not unknown
     if "words" not in args:
         raise Understood
     args.run(args)
-
-
-PARSE_ARGS = argparse.ArgumentParser.parse_args
 
 
 def headings(page: Path) -> set[str]:
