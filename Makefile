@@ -32,8 +32,8 @@ benchmark: .venv/.tests
 
 # The site; warnings are errors, for most of them are links that lead nowhere. Docstrings are read from the code beside it.
 docs: .venv/.docs
-	$(BIN)/python -m sphinx -W --keep-going --quiet docs docs/_build
-	@echo "Written: docs/_build/index.html"
+	$(BIN)/python -m sphinx -W --keep-going --quiet docs build/docs
+	@echo "Written: build/docs/index.html"
 
 # The demo has ten minutes in all: it needs no tools, and to compile all of torch takes longer than to import what is used.
 # Each stamp is named after the extras that it stands for.

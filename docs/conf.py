@@ -13,7 +13,6 @@ author = project_copyright = "The sb3_esad authors"
 release = __version__
 
 extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
-exclude_patterns = ["_build"]
 myst_heading_anchors = 3  # as GitHub names them, so that links work there, too
 
 html_theme = "furo"
@@ -31,7 +30,13 @@ def find_short_names(app: Sphinx, doctree: nodes.document) -> None:
             reference["refspecific"] = True
 
 
+def skip_fields(app: Sphinx, what: str, name: str, member: object, skip: bool, options: object) -> bool | None:
+    """Leave out the fields of records, which their docstrings describe as parameters."""
+    return True if type(member).__name__ == "_tuplegetter" else None
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Add what the extensions above do not do."""
     app.connect("doctree-read", find_short_names)
+    app.connect("autodoc-skip-member", skip_fields)
     return {"parallel_read_safe": True}
