@@ -31,11 +31,13 @@ TEXTS = {str(page.relative_to(ROOT)): page.read_text() for page in [ROOT / "READ
 EXAMPLE = re.compile(r"```python\n(?P<code>.*?)```(?:\n\n```text\n(?P<output>.*?)```)?", re.DOTALL)
 WITH_EXAMPLES = [page for page, text in TEXTS.items() if "```python" in text]
 SPANS = r"`((?:\.venv/bin/python|make|pip install) [^`]*)`"
-COMMANDS = {
-    line: page
-    for page, text in TEXTS.items()
-    for line in [*re.findall(SPANS, text), *"".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).splitlines()]
-}
+COMMANDS = sorted(
+    {
+        line
+        for text in TEXTS.values()
+        for line in [*re.findall(SPANS, text), *"".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).splitlines()]
+    }
+)
 LINKS = [(page, link) for page, text in TEXTS.items() for link in re.findall(r"\]\((?!https?:)(.*?)\)", text)]
 
 BRIEF = {"learning_starts": 20, "train_freq": 5, "gradient_steps": 1, "pretrain_steps": 1, "pretrain_gradient_steps": 0}
@@ -72,8 +74,10 @@ def test_examples_run(
         assert example["output"] in (None, capsys.readouterr().out)
 
 
-def test_there_are_examples_and_commands() -> None:
+def test_there_are_no_other_blocks() -> None:
     assert len(WITH_EXAMPLES) >= 5 and len(COMMANDS) >= 20
+    kinds = {kind for text in TEXTS.values() for kind in re.findall(r"^ *```(.+)", text, re.MULTILINE)}
+    assert kinds <= {"python", "bash", "text", "{toctree}", "{include} ../README.md", "{include} ../../README.md", "{eval-rst}"}
 
 
 class Understood(Exception):
