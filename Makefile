@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 TOO_OLD := "sb3_esad needs Python 3.10 or newer, $(PYTHON) is %d.%d; choose another with make PYTHON=python3.11"
 
-.PHONY: demo test lint type format benchmark
+.PHONY: demo test lint type format benchmark docs
 
 # Train briefly, evaluate and print the metrics.
 demo: .venv/.demo
@@ -30,9 +30,14 @@ benchmark: .venv/.tests
 	$(BIN)/python benchmark/update_speed.py
 	$(BIN)/python benchmark/predict_latency.py
 
+# The site; warnings are errors, for most of them are links that lead nowhere. Docstrings are read from the code beside it.
+docs: .venv/.docs
+	$(BIN)/python -m sphinx -W --keep-going --quiet docs build/docs
+	@echo "Written: build/docs/index.html"
+
 # The demo has ten minutes in all: it needs no tools, and to compile all of torch takes longer than to import what is used.
 # Each stamp is named after the extras that it stands for.
-.venv/.demo .venv/.tests: setup.cfg constraints.txt
+.venv/.demo .venv/.tests .venv/.docs: setup.cfg constraints.txt
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[$(@:.venv/.%=%)]"
