@@ -5,8 +5,7 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_esad.common.agent import LatentAgent
-from sb3_esad.common.functional import barrier_residual
-from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns
+from sb3_esad.common.functional import barrier_residual, discounted_sum
 from sb3_esad.common.type_aliases import LatentState
 
 
@@ -54,11 +53,14 @@ class Foresight:
         :return: fields of shape (N,)
         """
         imagined = agent.world_model.imagine(start, lambda grid: agent.actor(grid, deterministic=True), self.steps, self.gamma)
-        values = imagined_returns(agent.critic, imagined, self.gamma, lambda_=1.0)[0]
-        costs = imagined_costs(agent.cost_critic, imagined, self.cost_gamma, lambda_=1.0)[0]
+        rewards, costs, continues = imagined.predictions
+        end = imagined.grids[-1], imagined.actions[-1]
+        end_costs, end_variance = agent.cost_critic(*end)
+        values = discounted_sum(rewards, continues, agent.critic(*end).min(0).values, self.gamma)
+        means = discounted_sum(costs, continues, end_costs.max(0).values, self.cost_gamma)
         _, variance = agent.cost_critic(imagined.grids[0], imagined.actions[0])
-        risks = agent.cost_critic.risk(costs[None], variance, self.risk_level)
-        return Outlook(values, risks, self.risk(agent, imagined.grids[-1], imagined.actions[-1]))
+        risks = agent.cost_critic.risk(means[None], variance, self.risk_level)
+        return Outlook(values, risks, agent.cost_critic.risk(end_costs, end_variance, self.risk_level))
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """

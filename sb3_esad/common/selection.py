@@ -196,11 +196,8 @@ class SafetyFilter(ActionFilter):
         """The proposed action, and of samples of the actor and of uniform actions those that the critics fear least."""
         grids, size = agent.world_model.features(state), proposed.shape[1]
         samples = agent.actor(grids.repeat(self.n_proposals, 1, 1, 1)).unflatten(0, (self.n_proposals, -1))
-        uniform = 2 * th.rand(self.n_proposals, len(proposed), size, device=proposed.device) - 1
-        calmest = [self._calmest(agent, grids, actions, CALMEST) for actions in (samples, uniform)]
-        return th.cat([proposed[None], *calmest])
-
-    def _calmest(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor, n: int) -> th.Tensor:
-        risks = self.foresight.risk(agent, grids.repeat(len(actions), 1, 1, 1), actions.flatten(0, 1))
-        least = risks.view(actions.shape[:2]).topk(n, dim=0, largest=False).indices
-        return actions.gather(0, least[..., None].expand(-1, -1, actions.shape[2]))
+        actions = th.stack([samples, 2 * th.rand(self.n_proposals, len(proposed), size, device=proposed.device) - 1])
+        risks = self.foresight.risk(agent, grids.repeat(2 * self.n_proposals, 1, 1, 1), actions.flatten(0, 2))
+        calmest = risks.view(actions.shape[:3]).topk(CALMEST, dim=1, largest=False).indices
+        chosen = actions.gather(1, calmest[..., None].expand(-1, -1, -1, size))
+        return th.cat([proposed[None], chosen.flatten(0, 1)])
