@@ -10,7 +10,8 @@ import gymnasium
 import torch as th
 from stable_baselines3.common.utils import set_random_seed
 
-from sb3_esad import ESADLEND, __version__
+from sb3_esad import __version__
+from sb3_esad.algorithms import load_model
 from sb3_esad.demo import ENV_ID, MINUTES, TIMESTEPS, run_demo
 from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
 from sb3_esad.envs.drivers import DRIVERS
@@ -71,7 +72,7 @@ def make_parser() -> argparse.ArgumentParser:
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_evaluate)
     who = parser.add_mutually_exclusive_group(required=True)
-    who.add_argument("--model", type=Path, metavar="FILE.zip", help="saved ESADLEND model")
+    who.add_argument("--model", type=Path, metavar="FILE.zip", help="saved model of any algorithm")
     who.add_argument("--driver", choices=DRIVERS, help="scripted driver")
     parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
     parser.add_argument("--episodes", type=_positive, default=100, metavar="N", help="how many (default: %(default)s)")
@@ -92,7 +93,7 @@ def _evaluate(args: argparse.Namespace) -> None:
         records = evaluate_driver(args.driver, args.env, seeds)
     else:
         name, how = args.model.name, "stochastic" if args.stochastic else "deterministic"
-        model = ESADLEND.load(args.model)
+        model = load_model(args.model)
         if args.video:
             set_random_seed(args.seed)
             record_model(args.video, model, args.env, args.seed, not args.stochastic)
@@ -110,14 +111,14 @@ def _evaluate(args: argparse.Namespace) -> None:
 
 def _add_explain(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_explain)
-    parser.add_argument("--model", type=Path, required=True, metavar="FILE.zip", help="saved ESADLEND model")
+    parser.add_argument("--model", type=Path, required=True, metavar="FILE.zip", help="saved model that imagines")
     parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the episode (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("explanation.mp4"), metavar="FILE.mp4", help="(default: %(default)s)")
 
 
 def _explain(args: argparse.Namespace) -> None:
-    record_explanation(args.out, ESADLEND.load(args.model), args.env, args.seed)
+    record_explanation(args.out, load_model(args.model), args.env, args.seed)
     print(f"Written: {args.out}")
 
 

@@ -1,7 +1,11 @@
 """The algorithms of this package, by the names that commands, RL Zoo and the files of ``hyperparams/`` have for them."""
 
+from pathlib import Path
+from typing import Any
+
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
+from sb3_esad.common.description import described_class
 from sb3_esad.esad_lend import ADEND, ESADLEND, SADLEN
 from sb3_esad.wcsac import WCSAC, SACLag
 
@@ -12,3 +16,15 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
     "wcsac": WCSAC,
     "sac_lag": SACLag,
 }
+
+
+def load_model(path: Path) -> Any:
+    """
+    Load a saved model of any algorithm of this package.
+
+    :param path: its zip
+    :return: the model
+    :raises ValueError: if the file is missing, damaged, or holds something else
+    """
+    by_class = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
+    return by_class.get(described_class(path), ESADLEND).load(path)

@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 
 import gymnasium as gym
 import numpy as np
+from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_esad.common.costs import CostReader
 from sb3_esad.common.save_util import whole_file
@@ -37,6 +38,7 @@ def record_model(path: Path, model: ESADLEND, env_id: str, seed: int, determinis
     :raises ValueError: if the environment is no driving scenario with an image, or not one that the model knows
     """
     with closing(_make(env_id)) as env:
+        check_imagination(model)
         check_spaces(model, env, env_id)
         check_image(env, env_id)
         driver = DreamingDriver(model, deterministic=deterministic)
@@ -54,6 +56,7 @@ def record_explanation(path: Path, model: ESADLEND, env_id: str, seed: int) -> N
     :raises ValueError: if the environment is no driving scenario with an image, or not one that the model knows
     """
     with closing(_make(env_id)) as env:
+        check_imagination(model)
         check_spaces(model, env, env_id)
         check_image(env, env_id)
         write_video(path, _drive_model(env, ExplainedDriver(model), seed, explaining_frame), env.metadata["render_fps"])
@@ -95,6 +98,18 @@ def write_video(path: Path, frames: Iterable[Picture], fps: int) -> None:
         writer.send(None)
         for picture in chain([first], pictures):
             writer.send(np.ascontiguousarray(picture))
+
+
+def check_imagination(model: BaseAlgorithm) -> None:
+    """
+    Refuse a model that has nothing to dream with.
+
+    :param model: of any algorithm
+    :raises ValueError: if it has no world model
+    """
+    if not isinstance(model, ESADLEND):
+        name = type(model).__name__
+        raise ValueError(f"{name} has no world model whose dreams could be filmed; use RL Zoo's record_video for it.")
 
 
 def check_image(env: gym.Env[Any, Any], env_id: str) -> None:

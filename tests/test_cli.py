@@ -10,8 +10,9 @@ import pytest
 from conftest import CountingEnv
 from stable_baselines3 import SAC
 
-from sb3_esad import ESADLEND, __version__, demo
+from sb3_esad import ESADLEND, WCSAC, __version__, demo
 from sb3_esad.__main__ import main
+from sb3_esad.algorithms import ALGORITHMS, load_model
 from sb3_esad.hyperparams import Hyperparams
 
 TINY = {"net_arch": [8], "memory_channels": 4, "latent_channels": 2}
@@ -79,11 +80,21 @@ def test_evaluate_a_driver(driver: str, tmp_path: Path, capsys: pytest.CaptureFi
     assert (tmp_path / "a.mp4").stat().st_size > 1000
 
 
-def test_evaluate_in_any_environment(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    path = tmp_path / "model.zip"
-    ESADLEND("MlpPolicy", CountingEnv(), policy_kwargs=TINY, buffer_size=100).save(path)
-    assert main(["evaluate", "--model", str(path), "--env", "counting-v0", "--episodes", "2"]) == 0
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_evaluate_a_model_of_any_algorithm(name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    policy_kwargs = TINY if issubclass(ALGORITHMS[name], ESADLEND) else {"net_arch": [8]}
+    ALGORITHMS[name]("MlpPolicy", CountingEnv(), policy_kwargs=policy_kwargs, buffer_size=100).save(tmp_path / "model.zip")
+    assert type(load_model(tmp_path / "model")) is ALGORITHMS[name]
+    assert main(["evaluate", "--model", str(tmp_path / "model.zip"), "--env", "counting-v0", "--episodes", "2"]) == 0
     assert "| return ↑           | 28.0 [28.0, 28.0]" in capsys.readouterr().out
+
+
+def test_without_a_world_model_there_is_nothing_to_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "model.zip"
+    WCSAC("CnnPolicy", SHORT, policy_kwargs={"net_arch": [8]}, buffer_size=100).save(path)
+    for command in (["evaluate", "--video", str(tmp_path / "a.mp4")], ["explain", "--out", str(tmp_path / "a.mp4")]):
+        assert main([*command, "--model", str(path), "--env", SHORT]) == 2
+        assert "WCSAC has no world model whose dreams could be filmed" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,7 @@ import zipfile
 from contextlib import suppress
 from importlib import resources
 from inspect import Parameter
+from pathlib import Path
 from typing import IO, Any
 
 import gymnasium as gym
@@ -87,6 +88,19 @@ def read_setting(plain: Any, algorithm: type[OffPolicyAlgorithm]) -> Any:
     if isinstance(plain, dict) and plain.keys() == {"class"}:
         return named_classes(algorithm)[plain["class"]]
     return from_plain(plain)
+
+
+def described_class(path: Path) -> str:
+    """
+    Tell which algorithm a saved model is of.
+
+    :param path: its zip; ``.zip`` may be left out
+    :return: name of the class; empty if the file does not say, or is none of ours
+    """
+    with suppress(OSError, LookupError, TypeError, ValueError, zipfile.BadZipFile):
+        with zipfile.ZipFile(path if path.is_file() else f"{path}.zip") as archive:
+            return str(json.loads(archive.read(DESCRIPTION))["class"])
+    return ""
 
 
 def named_classes(algorithm: type[OffPolicyAlgorithm]) -> dict[str, type]:
