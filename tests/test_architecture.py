@@ -14,7 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     "common.type_aliases common.functional common.transforms common.torch_layers common.target_networks common.optimizers",
     "common.precision common.checks common.memory common.schedules common.side_by_side common.noise",
-    "common.plain_values common.plain_zip",
+    "common.plain_values common.plain_zip common.numpy_state",
     "common.costs common.six_values common.frames common.windows common.cost_buffers common.buffers",
     "common.recent_sums",
     "common.episode_record common.penalties common.multipliers common.entropy",

@@ -18,6 +18,7 @@ from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
 from sb3_esad.common.noise import fixed_seed
+from sb3_esad.common.numpy_state import NumpyState, from_numpy, to_numpy
 from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.rssm import RSSM
 from sb3_esad.common.selection import ActionFilter, NoFilter, Selection
@@ -25,8 +26,6 @@ from sb3_esad.common.target_networks import make_target
 from sb3_esad.common.torch_layers import GridReadout
 from sb3_esad.common.type_aliases import Belief, LatentState
 from sb3_esad.common.world_model import WorldModel
-
-NumpyState = tuple[np.ndarray, ...]
 
 
 class LatentPolicy(BasePolicy):
@@ -193,9 +192,9 @@ class LatentPolicy(BasePolicy):
                 f"predict() was given {n_envs} observation(s) with {len(start)} values of episode_start: {remedy}."
             )
         starts = th.as_tensor(start, device=self.device)
-        belief, selection = self.decide(tensor, self._from_numpy(state, n_envs), starts, deterministic)
+        belief, selection = self.decide(tensor, from_numpy(state, self.initial_state(n_envs)), starts, deterministic)
         actions = selection.actions
-        new_state = tuple(field.flatten(1)[None].cpu().numpy() for field in belief.state._replace(action=actions))
+        new_state = to_numpy(belief.state._replace(action=actions))
         unscaled = self.unscale_action(actions.cpu().numpy().reshape(-1, *self.action_space.shape))
         unscaled = unscaled.astype(self.action_space.dtype, copy=False)
         return (unscaled if vectorized else unscaled[0]), new_state
@@ -231,18 +230,6 @@ class LatentPolicy(BasePolicy):
         :return: actions scaled to [-1, 1], of shape (N, A)
         """
         return self._predict(observation, deterministic)
-
-    def _from_numpy(self, state: NumpyState | None, n_envs: int) -> LatentState:
-        initial = self.initial_state(n_envs)
-        if state is None:
-            return initial
-        shapes = [tuple(np.shape(array)) for array in state]
-        expected = [(1, n_envs, field[0].numel()) for field in initial]
-        if shapes != expected:
-            remedy = "pass what the last call returned for these environments, or None to start afresh"
-            raise ValueError(f"predict() was given {n_envs} observation(s) with a state of shapes {shapes}: {remedy}.")
-        fields = (th.as_tensor(array[0], dtype=th.float32, device=self.device) for array in state)
-        return LatentState(*(field.view_as(zeros) for field, zeros in zip(fields, initial, strict=True)))
 
     @staticmethod
     def _refuse_gym_reset(observation: Any) -> None:
