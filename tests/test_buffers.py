@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.type_aliases import NO_EVENT, SequenceSamples
-from sb3_esad.common.windows import WindowIndex, event_weights, time_to_event
+from sb3_esad.common.windows import WindowIndex, event_weights, recency_weights, time_to_event
 from tests.conftest import CountingEnv
 
 EPISODE = 7
@@ -227,21 +227,30 @@ def test_known_weights() -> None:
     assert event_weights(np.array([False]), 0.0, 10, 0).tolist() == [1.0]
 
 
-@pytest.mark.parametrize("fraction", [0.25, 0.5])
-def test_weights_are_unbiased(fraction: float) -> None:
+@pytest.mark.parametrize(("fraction", "recency"), [(0.25, 0.0), (0.5, 0.0), (0.5, 3.0)])
+def test_weights_are_unbiased(fraction: float, recency: float) -> None:
     env = make_env(2)
-    buffer = make_buffer(env, size=400, length=8, event_fraction=fraction)
-    costs = (np.random.rand(200, 2) < 0.01) * np.random.rand(200, 2)
+    buffer = make_buffer(env, size=400, length=8, event_fraction=fraction, recency=recency)
+    add_costs(buffer, np.ones((7, 2)))  # of which nothing is left
+    costs = (np.random.rand(200, 2) < np.linspace(0.03, 0.0, 200)[:, None]) * np.random.rand(200, 2)
     add_costs(buffer, costs)
-    starts = np.lib.stride_tricks.sliding_window_view(costs, 8, axis=0)
+    starts = np.lib.stride_tricks.sliding_window_view(costs, 8, axis=0).mean(axis=(1, 2))
+    expected = np.average(starts, weights=np.exp(recency * np.linspace(0.0, 1.0, len(starts))))
     weighted, weights = [], []
     for _ in range(2000):
         samples = buffer.sample(16)
         weighted.append((samples.event_weights * samples.costs.mean(dim=1)).mean().item())
         weights.append(samples.event_weights.mean().item())
-    assert np.mean(weighted) == pytest.approx(starts.mean(), rel=0.03)
-    assert np.mean(weights) == pytest.approx(1.0, rel=0.01)
-    assert np.std(weighted) / np.sqrt(2000) < 0.02 * starts.mean()
+    assert np.mean(weighted) == pytest.approx(expected, rel=0.04)
+    assert np.mean(weights) == pytest.approx(1.0, rel=0.02)
+    assert np.std(weighted) / np.sqrt(2000) < 0.02 * expected
+
+
+def test_known_recency() -> None:
+    weights = recency_weights(np.linspace(0.0, 1.0, 1001), 3.0)
+    assert weights.mean() == pytest.approx(1.0, rel=1e-3)
+    assert weights[-1] / weights[0] == pytest.approx(np.exp(3.0), rel=1e-5)
+    assert recency_weights(np.array([0.0, 1.0]), 0.0).tolist() == [1.0, 1.0]
 
 
 def test_time_to_event() -> None:
@@ -431,6 +440,7 @@ def test_search_for_events_is_fast_with_many_steps() -> None:
         ({"length": 61}, "sequence_length is 61; choose it from 1 to 60"),
         ({"length": 0}, "sequence_length is 0"),
         ({"event_fraction": 1.0}, "event_fraction is 1.0"),
+        ({"recency": -1.0}, "recency is -1.0"),
     ],
 )
 def test_refuses_what_it_cannot_do(kwargs: dict[str, Any], message: str) -> None:

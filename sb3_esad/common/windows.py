@@ -84,6 +84,18 @@ def event_weights(has_event: np.ndarray, fraction: float, n_windows: int, n_even
     return (1.0 / density).astype(np.float32)
 
 
+def recency_weights(places: np.ndarray, recency: float) -> np.ndarray:
+    """
+    Importance weights by which what is newer counts for more: exponential in the age, of expectation 1 over all ages.
+
+    :param places: from 0 for the oldest to 1 for the newest, any shape
+    :param recency: >= 0, logarithm of the newest's weight over that of the oldest; 0 for equal weights
+    :return: float32, of the shape of ``places``
+    """
+    scale = recency / -np.expm1(-recency) if recency > 0 else 1.0
+    return (scale * np.exp(recency * (places - 1.0))).astype(np.float32)
+
+
 def time_to_event(events: np.ndarray, lasts: np.ndarray) -> np.ndarray:
     """
     Steps until the next event of the same episode.
