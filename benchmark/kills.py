@@ -1,10 +1,10 @@
 """
 What a training survives: ``python benchmark/kills.py --kills 20``.
 
-A small training on one thread is killed (SIGKILL) again and again and resumed each time, every other time in the midst of a
-save, until it ends; then it is run with a disk that is full after its first checkpoint, and resumed. Prints what came of it, and
-ends with exit code 1 unless each kill was followed by a run that went on from the newest checkpoint, no checkpoint was ever
-lost, not more than one interval had to be made again, and both trainings ended as the one that nobody disturbed.
+A small training on one thread is killed (SIGKILL) again and again, every other time in the midst of a save, and resumed each
+time until it ends; then another one has a disk that is full after its first checkpoint, and is resumed. Prints what came of it,
+and ends with exit code 1 unless each kill was followed by a run that went on from the newest checkpoint, no checkpoint was lost,
+no more than an interval and a rollout had to be made again, and both ended as the training that nobody disturbed.
 """
 
 import argparse
@@ -32,13 +32,17 @@ from stable_baselines3.common.callbacks import BaseCallback
 
 from sb3_esad.algorithms import ALGORITHMS
 from sb3_esad.common.checkpoints import CHECKPOINT, MODEL, RunCheckpointCallback
+from sb3_esad.common.latent_algorithm import LatentAlgorithm
 
 INTERVAL, ROLLOUT = 40, 4
 SAVE = 0.05
 """Seconds that a save takes at least."""
 COMMON = {"batch_size": 4, "buffer_size": 2000, "learning_starts": 20, "train_freq": ROLLOUT, "seed": 0, "device": "cpu"}
-NETWORKS: dict[str, Any] = {"net_arch": [16], "memory_channels": 8, "latent_channels": 4}
-IMAGINING = {"sequence_length": 8, "imagination_starts": 16, "imagination_horizon": 3, "pretrain_steps": 1}
+MODEL_FREE: dict[str, Any] = {"policy_kwargs": {"net_arch": [16]}}
+IMAGINING = {
+    "policy_kwargs": {"net_arch": [16], "memory_channels": 8, "latent_channels": 4},
+    **{"sequence_length": 8, "imagination_starts": 16, "imagination_horizon": 3, "pretrain_steps": 1},
+}
 
 
 class Drift(gym.Env):
@@ -101,10 +105,7 @@ def train(folder: Path, algo: str, total: int, pipe: Connection, steps: c_longlo
     """
     th.set_num_threads(1)
     algorithm: Any = ALGORITHMS[algo]
-    imagines = hasattr(algorithm, "_update_world_model")
-    settings = (
-        {**COMMON, **IMAGINING, "policy_kwargs": NETWORKS} if imagines else {**COMMON, "policy_kwargs": {"net_arch": [16]}}
-    )
+    settings = {**COMMON, **(IMAGINING if issubclass(algorithm, LatentAlgorithm) else MODEL_FREE)}
     there = (folder / CHECKPOINT).exists()
     model = algorithm.resume(folder, Drift()) if there else algorithm("MlpPolicy", Drift(), **settings)
     callbacks = [Steps(folder, pipe, steps, disk_gets_full), RunCheckpointCallback(INTERVAL, folder)]
@@ -126,9 +127,8 @@ def digest(model: Any) -> str:
     numbers = hashlib.sha256()
     for value in leaves([model.get_parameters(), buffer.actions, buffer.rewards, buffer.costs, buffer.dones]):
         numbers.update(np.asarray(value).tobytes())
-    return (
-        f"{model.num_timesteps} steps, {model._n_updates} updates, {model._episode_num} episodes, {numbers.hexdigest()[:16]}"
-    )
+    counters = f"{model.num_timesteps} steps, {model._n_updates} updates, {model._episode_num} episodes"
+    return f"{counters}, {numbers.hexdigest()[:16]}"
 
 
 def leaves(nested: Any) -> Iterator[Any]:
@@ -272,19 +272,17 @@ def main() -> None:
     total = (args.kills + 10) * INTERVAL
     with TemporaryDirectory() as name:
         folders = [Path(name, each) for each in ("undisturbed", "killed", "full")]
-        start = time.monotonic()
-        undisturbed, _ = Training(folders[0], args.algo, total).end()
+        training, start = Training(folders[0], args.algo, total), time.monotonic()
+        undisturbed, _ = training.end()
         interval = (time.monotonic() - start) * INTERVAL / total
         print(f"undisturbed: {undisturbed}, {interval:.2f} s from one checkpoint to the next", flush=True)
         outcome = endure(folders[1], args.algo, total, args.kills, longest=2 * interval)
-        print(
-            f"{outcome.resumed} of {outcome.kills} resumed, {outcome.lost} checkpoints lost, {outcome.in_a_save} killed in a save"
-        )
+        print(f"{outcome.kills} kills, {outcome.in_a_save} of them in a save: {outcome.resumed} resumed, {outcome.lost} lost")
         print(f"at most {outcome.repeated} steps made again; in the end: {outcome.digest}", flush=True)
         _, told = Training(folders[2], args.algo, total, disk_gets_full=True).end()
         kept = steps_of(folders[2])
         after, _ = Training(folders[2], args.algo, total).end()
-    print(f"full disk: {len(told)} warning, the checkpoint of {kept} steps stayed; resumed, in the end: {after}")
+    print(f"full disk: {len(told)} warning, the checkpoint of {kept} steps stayed; in the end: {after}")
     unharmed = outcome.resumed == outcome.kills and outcome.lost == 0 and outcome.repeated <= INTERVAL + ROLLOUT
     if not unharmed or len(told) != 1 or not undisturbed == outcome.digest == after:
         sys.exit("That is not what should have come of it.")
