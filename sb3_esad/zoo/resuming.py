@@ -75,11 +75,24 @@ class ResumableManager(CostAwareManager):
         require(algo in ALGORITHMS, "--algo", algo, f"one of {', '.join(ALGORITHMS)}, which have checkpoints")
         super().__init__(args, algo, *rest, **kwargs)
         self.checkpoint_freq = checkpoint_freq
+        self.is_new = folder is None
         if folder is not None:
             self.save_path, self.params_path = str(folder), str(folder / self.env_name)
         # A run that was cut off before its first checkpoint begins anew
         self.goes_on = folder is not None and (folder / CHECKPOINT).exists()
         self.continue_training = self.continue_training or self.goes_on
+
+    def read_hyperparameters(self) -> tuple[dict[str, Any], dict[str, Any]]:
+        """
+        Read the settings, and note those of a new experiment.
+
+        :return: the settings, twice
+        :raises ValueError: if they cannot be noted
+        """
+        hyperparams, saved_hyperparams = super().read_hyperparameters()
+        if self.is_new:
+            self._save_run(saved_hyperparams)
+        return hyperparams, saved_hyperparams
 
     def _preprocess_hyperparams(self, hyperparams: dict[str, Any]) -> Any:
         processed = super()._preprocess_hyperparams(hyperparams)
@@ -100,11 +113,6 @@ class ResumableManager(CostAwareManager):
         model = model.resume(self.save_path, env, self.device)
         print(f"Going on after {model.num_timesteps} steps of {self.n_timesteps}")
         return model
-
-    def _save_config(self, saved_hyperparams: dict[str, Any]) -> None:
-        super()._save_config(saved_hyperparams)
-        if not self.goes_on:
-            self._save_run(saved_hyperparams)
 
     def _save_run(self, saved_hyperparams: dict[str, Any]) -> None:
         command = [*sys.argv[1:], "--seed", str(self.seed)]  # which RL Zoo has drawn unless it was given
