@@ -2,9 +2,9 @@
 What a training survives: ``python benchmark/kills.py --kills 20``.
 
 A small training on one thread is killed (SIGKILL) again and again, every other time in the midst of a save, and resumed each
-time until it ends; then another one has a disk that is full after its first checkpoint, and is resumed. Prints what came of it,
-and ends with exit code 1 unless each kill was followed by a run that went on from the newest checkpoint, no checkpoint was lost,
-no more than an interval and a rollout had to be made again, and both ended as the training that nobody disturbed.
+time until it ends; then another one has a disk that is full after its first checkpoint, and is resumed. Prints what came of
+it, and ends with exit code 1 unless each kill was followed by a run that went on from the newest checkpoint, no checkpoint was
+lost, no more than an interval and a rollout had to be made again, and both ended as the training that nobody disturbed.
 """
 
 import argparse
@@ -156,9 +156,9 @@ class Training:
     """
 
     def __init__(self, folder: Path, algo: str, total: int, disk_gets_full: bool = False) -> None:
-        # Each process is forked from one that has imported everything and done nothing
+        # Each process is forked from one that has done nothing but import, also what torch's optimisers do late
         context = multiprocessing.get_context("forkserver")
-        context.set_forkserver_preload(["sb3_esad"])
+        context.set_forkserver_preload(["sb3_esad", "torch._dynamo"])
         self.folder = folder
         self.pipe, theirs = context.Pipe()
         self.steps = context.RawValue("q", 0)

@@ -15,7 +15,7 @@ from sb3_esad.common.checkpoints import CHECKPOINT
 from tests.conftest import assert_same
 
 ENV, ROOT = "Pendulum-v1", Path(__file__).parents[1]
-STEPS = 300
+STEPS = 304
 SETTINGS = "policy:'MlpPolicy' buffer_size:1000 learning_starts:100 train_freq:8 policy_kwargs:dict(net_arch=[16])"
 
 
