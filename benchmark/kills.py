@@ -34,7 +34,7 @@ from sb3_esad.algorithms import ALGORITHMS
 from sb3_esad.common.checkpoints import CHECKPOINT, MODEL, RunCheckpointCallback
 from sb3_esad.common.latent_algorithm import LatentAlgorithm
 
-INTERVAL, ROLLOUT = 40, 4
+INTERVAL, ROLLOUT = 40, 8
 SAVE = 0.05
 """Seconds that a save takes at least."""
 COMMON = {"batch_size": 4, "buffer_size": 2000, "learning_starts": 20, "train_freq": ROLLOUT, "seed": 0, "device": "cpu"}
@@ -269,7 +269,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=20, help="how often (default: %(default)s)")
     parser.add_argument("--algo", choices=ALGORITHMS, default="esad_lend", help="default: %(default)s")
     args = parser.parse_args()
-    total = (args.kills + 10) * INTERVAL
+    total = (args.kills + 5) * INTERVAL
     with TemporaryDirectory() as name:
         folders = [Path(name, each) for each in ("undisturbed", "killed", "full")]
         training, start = Training(folders[0], args.algo, total), time.monotonic()
