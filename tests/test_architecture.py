@@ -25,7 +25,7 @@ LAYERS = [
     "common.foresight",
     "common.selection",
     "common.policies common.callbacks common.evaluation common.save_util",
-    "common.description common.untrusted common.whole_files",
+    "common.description common.untrusted common.whole_files common.checkpoints",
     "common.cost_aware_algorithm common.cost_limited_algorithm",
     "common.recurrent_algorithm common.latent_algorithm common.constrained_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",

@@ -313,6 +313,16 @@ def test_images_stay_bytes_and_are_stored_once() -> None:
     assert (samples.next_observations[:, :, 0, 0, 0] == samples.rewards).all()  # type: ignore[index]
 
 
+def test_a_young_buffer_needs_little_room_in_a_file() -> None:
+    env = DummyVecEnv([lambda: PictureEnv(episode_length=40)])
+    buffer = make_buffer(env, size=2000, length=32)
+    collect(env, [buffer], 100)
+    content = pickle.dumps(buffer)
+    assert len(content) <= 1.1 * 100 * 3 * 64 * 64
+    loaded = pickle.loads(content)
+    assert loaded.observations is loaded._frames.frames and loaded.observations.shape == buffer.observations.shape
+
+
 class DictEnv(CountingEnv):
     """Three views of the number of the step."""
 

@@ -106,15 +106,19 @@ def test_normalisation_leaves_costs_alone() -> None:
     assert th.equal(normalised.costs, raw.costs) and normalised.rewards.dtype == th.float32
 
 
-def test_pickling() -> None:
+@pytest.mark.parametrize("n_steps", [10, 77])
+def test_pickling(n_steps: int) -> None:
     env = make_env(2, episode_length=EPISODE)
     buffer = make_buffer(env)
-    collect(env, [buffer], 77)
+    collect(env, [buffer], n_steps)
     file = io.BytesIO()
     save_to_pkl(file, buffer)
     file.seek(0)
-    for one, other in zip(draw(load_from_pkl(file)), draw(buffer), strict=True):
-        assert th.equal(one, other)
+    loaded = load_from_pkl(file)
+    for _ in range(2):
+        for one, other in zip(draw(loaded), draw(buffer), strict=True):
+            assert th.equal(one, other)
+        collect(env, [loaded, buffer], 30)  # both go on
 
 
 def test_memory_optimisation_would_lose_crashes() -> None:

@@ -23,13 +23,19 @@ def prepend(first: BaseCallback, callback: MaybeCallback) -> list[BaseCallback]:
     """
     given = callback if isinstance(callback, list) else [callback]
     others = [each if isinstance(each, BaseCallback) else ConvertCallback(each) for each in given]
-    return others if any(_holds(each, type(first)) for each in others) else [first, *others]
+    there = any(isinstance(each, type(first)) for other in others for each in all_callbacks(other))
+    return others if there else [first, *others]
 
 
-def _holds(callback: BaseCallback, kind: type[BaseCallback]) -> bool:
-    """Whether a callback is of a kind, or a list with one of it."""
+def all_callbacks(callback: BaseCallback) -> list[BaseCallback]:
+    """
+    List a callback and, if it is a list, those in it.
+
+    :param callback: any
+    :return: in the order in which they run
+    """
     inner = callback.callbacks if isinstance(callback, CallbackList) else []
-    return isinstance(callback, kind) or any(_holds(each, kind) for each in inner)
+    return [callback, *(each for child in inner for each in all_callbacks(child))]
 
 
 class LagrangeCallback(BaseCallback):
@@ -60,6 +66,11 @@ class LagrangeCallback(BaseCallback):
     def _on_rollout_end(self) -> None:
         for name, value in self.model.penalty.update(*self.model.take_violation()).items():
             self.logger.record(f"train/{name}", value)
+
+
+RESULTS = ("last_mean_reward", "last_mean_cost", "best_mean_reward", "best_mean_cost", "_best_score")
+EVALUATIONS = tuple(f"evaluations_{name}" for name in ("timesteps", "results", "length", "successes", "costs"))
+"""What evaluations have found, by the names of the attributes."""
 
 
 class CostEvalCallback(EvalCallback):
@@ -107,6 +118,22 @@ class CostEvalCallback(EvalCallback):
         if self.callback is not None:
             continue_training = continue_training and self._on_event()
         return continue_training
+
+    def state_dict(self) -> dict[str, Any]:
+        """
+        Give what a resumed run must know of the evaluations before it.
+
+        :return: values that JSON has
+        """
+        return {name: getattr(self, name) for name in (*RESULTS, *EVALUATIONS)}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """
+        Go on after the evaluations of a run that was cut off.
+
+        :param state: what :meth:`state_dict` gave
+        """
+        vars(self).update(state, _best_score=tuple(state["_best_score"]))
 
     def _evaluate(self) -> tuple[list[float], list[int], list[float]]:
         if self.model.get_vec_normalize_env() is not None:

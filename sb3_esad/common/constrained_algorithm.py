@@ -81,6 +81,15 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
         self.policy.action_filter = self._make_filter()
         self._selections = SelectionRates()
 
+    def begin_anew(self, seed: int) -> None:
+        """
+        Begin new episodes, and count anew how often actions are replaced.
+
+        :param seed: see :meth:`CostAwareAlgorithm.begin_anew`
+        """
+        super().begin_anew(seed)
+        self._selections = SelectionRates()
+
     def _make_penalty(self, **further: Any) -> Penalty:
         return super()._make_penalty(barrier_coef=self.barrier_coef, **further)
 

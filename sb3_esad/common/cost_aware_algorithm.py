@@ -1,13 +1,16 @@
 """An off-policy algorithm whose every step may have a cost."""
 
+from pathlib import Path
 from typing import Any, ClassVar, TypeVar
 
 import numpy as np
+import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
-from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
+from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import safe_mean
 
+from sb3_esad.common.checkpoints import Progress, read_checkpoint, resume_callbacks
 from sb3_esad.common.checks import refuse_blank_images, require
 from sb3_esad.common.cost_buffers import CostBuffer, CostReplayBuffer
 from sb3_esad.common.costs import EpisodeCosts
@@ -39,6 +42,7 @@ class CostAwareAlgorithm(WholeFiles):
             require(given is None, f"replay_buffer_kwargs[{name!r}]", given, f"it as the argument {name}")
         self.cost_key = cost_key
         self.total_cost = 0.0
+        self._interrupted: Progress | None = None
 
     def _check_arguments(self) -> None:
         require(self.batch_size >= 1, "batch_size", self.batch_size, "a number of samples >= 1")
@@ -78,6 +82,40 @@ class CostAwareAlgorithm(WholeFiles):
         """
         name = tb_log_name or type(self).__name__
         return super().learn(total_timesteps, callback, log_interval, name, reset_num_timesteps, progress_bar)
+
+    @classmethod
+    def resume(cls: type[SelfCostAware], path: str | Path, env: GymEnv, device: th.device | str = "auto") -> SelfCostAware:
+        """
+        Load the newest checkpoint of a run that was cut off, with all that a :class:`RunCheckpointCallback` has saved.
+
+        The first ``learn`` of the model goes on with that run: hand it the same arguments as at first, for the steps that have
+        been made count among its ``total_timesteps``. The checkpoint holds pickles of SB3, so resume your own runs only.
+
+        :param path: folder of the run
+        :param env: environment to go on with, built like the one of the run
+        :param device: where to compute
+        :return: the model
+        :raises ValueError: if there is no checkpoint, or one of another algorithm or of other environments
+        """
+        model, progress = read_checkpoint(Path(path), cls, env, device)
+        model._interrupted = progress
+        return model
+
+    def begin_anew(self, seed: int) -> None:
+        """
+        Begin new episodes in all environments: what follows depends on the seed and on what is saved, but on nothing else.
+
+        :param seed: of all random numbers, those of the environments included
+        """
+        assert self.env is not None
+        self.set_random_seed(seed)
+        self._last_obs = self.env.reset()  # type: ignore[assignment]
+        self._last_episode_starts = np.ones(self.env.num_envs, dtype=bool)
+        if self._vec_normalize_env is not None:
+            self._last_original_obs = self._vec_normalize_env.get_original_obs()
+        if self.action_noise is not None:
+            self.action_noise.reset()
+        self._episode_costs.clear()
 
     def collect_rollouts(self, *args: Any, **kwargs: Any) -> RolloutReturn:
         """
@@ -134,9 +172,24 @@ class CostAwareAlgorithm(WholeFiles):
         for name, values in logs.items():
             self.logger.record(f"train/{name}", float(np.mean(values)))
 
-    def _setup_learn(self, *args: Any, **kwargs: Any) -> tuple[int, BaseCallback]:
+    def _setup_learn(
+        self,
+        total_timesteps: int,
+        callback: MaybeCallback = None,
+        reset_num_timesteps: bool = True,
+        *args: Any,
+        **kwargs: Any,
+    ) -> tuple[int, BaseCallback]:
         keep_freed_memory()
-        result = super()._setup_learn(*args, **kwargs)
+        progress, start = self._interrupted, self._num_timesteps_at_start
+        if progress is not None:
+            self.begin_anew(progress.seed)
+            total_timesteps, reset_num_timesteps = total_timesteps - (self.num_timesteps - start), False
+        result = super()._setup_learn(total_timesteps, callback, reset_num_timesteps, *args, **kwargs)
+        if progress is not None:
+            self._interrupted, self._num_timesteps_at_start = None, start
+            self.start_time -= progress.elapsed
+            resume_callbacks(result[1], progress)
         if self.num_timesteps == 0:
             self.total_cost = 0.0
         assert self._last_obs is not None and self._last_episode_starts is not None
@@ -146,4 +199,4 @@ class CostAwareAlgorithm(WholeFiles):
         return result
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_episode_costs"]
+        return [*super()._excluded_save_params(), "_episode_costs", "_interrupted"]

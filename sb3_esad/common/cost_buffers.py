@@ -10,8 +10,11 @@ from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_esad.common.costs import CostReader
-from sb3_esad.common.frames import ObservationArray, make_frame_store
+from sb3_esad.common.frames import ObservationArray, make_frame_store, padded
 from sb3_esad.common.type_aliases import CostReplaySamples
+
+ROWS = ("actions", "rewards", "costs", "dones", "timeouts", "episode_starts")
+"""Arrays of a buffer that have a row for each step."""
 
 
 class CostBuffer(ReplayBuffer):
@@ -66,6 +69,15 @@ class CostBuffer(ReplayBuffer):
         self.dones = np.zeros(shape, dtype=np.float32)
         self.timeouts = np.zeros(shape, dtype=np.float32)
         self.episode_starts = np.zeros(shape, dtype=bool)
+
+    def __getstate__(self) -> dict[str, Any]:
+        # Rows that no step has reached yet are most of a young buffer, and would be written to each file
+        return {**vars(self), "observations": None, **{name: getattr(self, name)[: self.size()] for name in ROWS}}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        vars(self).update(state)
+        self.observations = self._frames.frames
+        vars(self).update({name: padded(getattr(self, name), self.buffer_size) for name in ROWS})
 
     def take_settings_of(self, other: "CostBuffer") -> None:
         """

@@ -114,6 +114,15 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
     def _init_callback(self, callback: MaybeCallback, progress_bar: bool = False) -> BaseCallback:
         return super()._init_callback(prepend(LagrangeCallback(), callback), progress_bar)
 
+    def begin_anew(self, seed: int) -> None:
+        """
+        Begin new episodes, and forget what the penalty has seen of those under way.
+
+        :param seed: see :meth:`CostAwareAlgorithm.begin_anew`
+        """
+        super().begin_anew(seed)
+        self.penalty.forget_unfinished()
+
     def take_violation(self) -> tuple[th.Tensor | None, int]:
         """
         Hand over how far the expected risk exceeded the budget since the last call.

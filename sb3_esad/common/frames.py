@@ -9,9 +9,22 @@ from stable_baselines3.common.preprocessing import get_obs_shape
 ObservationArray = np.ndarray | dict[str, np.ndarray]
 
 
+def padded(rows: np.ndarray, n: int) -> np.ndarray:
+    """
+    Add rows of zeros.
+
+    :param rows: (m, ...), m <= n
+    :param n: how many there shall be
+    :return: (n, ...)
+    """
+    whole = np.zeros((n, *rows.shape[1:]), dtype=rows.dtype)
+    whole[: len(rows)] = rows
+    return whole
+
+
 class FrameStore:
     """
-    Ring of frames in which the successor of a frame is the next frame of the ring.
+    Ring of frames in which the successor of a frame is the next frame of the ring; a pickle of it has those written only.
 
     The exceptions are kept aside: the successor of the newest frame, and the last frame of each episode, which the first
     frame of the following one would otherwise replace.
@@ -29,7 +42,7 @@ class FrameStore:
 
     def clear(self) -> None:
         """Forget all frames."""
-        self._newest = -1
+        self._newest, self._n_written = -1, 0
         self._set_aside: dict[tuple[int, int], np.ndarray] = {}
 
     def add(self, step: int, obs: np.ndarray, next_obs: np.ndarray) -> np.ndarray:
@@ -49,8 +62,16 @@ class FrameStore:
             self._set_aside.pop((step, env), None)
         self.frames[step] = obs
         self._heads[:] = np.asarray(next_obs).reshape(self._heads.shape)
-        self._newest = step
+        self._newest, self._n_written = step, max(self._n_written, step + 1)
         return jumps
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**vars(self), "frames": self.frames[: self._n_written], "buffer_size": len(self.frames)}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        buffer_size = state.pop("buffer_size")
+        vars(self).update(state)
+        self.frames = padded(self.frames, buffer_size)
 
     def get(self, steps: np.ndarray, envs: np.ndarray) -> np.ndarray:
         """

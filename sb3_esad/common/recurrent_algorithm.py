@@ -140,6 +140,15 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
         self._last_latent = None
         self._random_actions: np.ndarray | None = None
 
+    def begin_anew(self, seed: int) -> None:
+        """
+        Begin new episodes, of which nothing is remembered.
+
+        :param seed: see :meth:`CostAwareAlgorithm.begin_anew`
+        """
+        super().begin_anew(seed)
+        self._last_latent = self._random_actions = None
+
     # Acting: SB3 asks for an action without a memory
 
     def _sample_action(

@@ -17,6 +17,7 @@ from unittest import mock
 from imageio_ffmpeg import get_ffmpeg_exe
 
 from sb3_esad.zoo.hub import load_from_hub, push_to_hub
+from sb3_esad.zoo.resuming import train
 
 
 def run(command: str, arguments: Sequence[str]) -> None:
@@ -92,7 +93,7 @@ def _ffmpeg_on_path() -> Iterator[None]:
 
 
 COMMANDS: dict[str, Callable[[], None]] = {
-    "train": partial(_call, "rl_zoo3.train", "train"),
+    "train": train,
     "optimize": _optimize,
     "enjoy": partial(_call, "rl_zoo3.enjoy", "enjoy"),
     "record_video": partial(_run_script, "rl_zoo3.record_video"),
