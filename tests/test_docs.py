@@ -21,6 +21,7 @@ from test_architecture import RANKS
 
 from sb3_esad import ESADLEND, driving_evaluation
 from sb3_esad.__main__ import make_parser
+from sb3_esad.common.checkpoints import RunCheckpointCallback
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.hyperparams import constructor_arguments
 
@@ -45,7 +46,7 @@ BRIEF = {"learning_starts": 20, "train_freq": 5, "gradient_steps": 1, "pretrain_
 
 @pytest.fixture
 def brief(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Trainings have 25 steps, and an update at their end; models and drivers are judged by the first two episodes."""
+    """Trainings have 25 steps, a checkpoint and an update at their end; models and drivers are judged by two episodes."""
     learn = OffPolicyAlgorithm.learn
 
     def learn_briefly(self: OffPolicyAlgorithm, total_timesteps: int, *args: Any, **kwargs: Any) -> OffPolicyAlgorithm:
@@ -57,6 +58,7 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
         return evaluate(who, env_id, seeds[:2])
 
     monkeypatch.setattr(OffPolicyAlgorithm, "learn", learn_briefly)
+    monkeypatch.setattr(RunCheckpointCallback, "save_freq", property(lambda _: 10, lambda *_: None), raising=False)
     for name in ("evaluate_model", "evaluate_driver"):
         monkeypatch.setattr(driving_evaluation, name, partial(briefly, getattr(driving_evaluation, name)))
 
@@ -94,6 +96,7 @@ def only_parse(monkeypatch: pytest.MonkeyPatch) -> None:
         raise Understood
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr("sb3_esad.zoo.resuming._read_run", lambda folder: {"command": [], "checkpoint_freq": 1})
 
 
 @pytest.mark.parametrize("command", COMMANDS)
