@@ -1,4 +1,4 @@
-"""The Python of the README runs, with trainings cut to a few steps; its commands are understood, its links lead somewhere."""
+"""The Python of the README and of docs/watching.md runs, in a few steps; its commands are understood, its links lead somewhere."""
 
 import re
 import shlex
@@ -15,7 +15,8 @@ from sb3_esad.hyperparams import constructor_arguments
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text()
-EXAMPLES = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+WATCHING = (ROOT / "docs" / "watching.md").read_text()
+EXAMPLES = re.findall(r"```python\n(.*?)```", README + WATCHING, re.DOTALL)
 COMMANDS = re.findall(r"`\.venv/bin/python -m sb3_esad (.*?)`", README)
 TRAINING_STEPS = 30
 
