@@ -341,7 +341,7 @@ def test_another_number_of_environments() -> None:
 
 
 def test_warns_once_at_the_upper_bound() -> None:
-    penalty = make_penalty(lagrangian_multiplier_init=50.0)
+    penalty = make_penalty(lagrangian_multiplier_init=50.0, episode_length=1)
     calibrate(penalty, 5.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
@@ -356,17 +356,17 @@ def test_warns_once_at_the_upper_bound() -> None:
 
 
 def test_a_multiplier_at_its_bound_is_no_infeasible_limit_where_the_road_is_content() -> None:
-    penalty = make_penalty(lagrangian_multiplier_init=50.0)
+    penalty = make_penalty(lagrangian_multiplier_init=50.0, episode_length=1)
     calibrate(penalty, 0.5)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(499):
             penalty.update(1.0)
-    with pytest.warns(UserWarning, match=r"bound 50.0 for 500 updates though an episode costs 0.5 of 1.0 allowed;"):
+    with pytest.warns(UserWarning, match=r"bound 50.0 for 500 updates though an episode of 1 steps costs 0.5 of 1.0 allowed;"):
         penalty.update(1.0)
     observe_episodes(penalty, cost=5.0)
     penalty.note_prediction(th.full((100,), 5.0))
-    with pytest.warns(UserWarning, match="an episode still costs 5: cost_limit=1.0 looks infeasible"):
+    with pytest.warns(UserWarning, match="an episode of 1 steps still costs 5: cost_limit=1.0 looks infeasible"):
         penalty.update(1.0)
 
 

@@ -185,14 +185,16 @@ class AugmentedLagrangian(Penalty):
         self.updates_at_bound.add_(gradient_steps).mul_(self.multiplier >= self.upper_bound)
         if self.updates_at_bound < PATIENCE:
             return
-        cost = self.episodes.expected_cost
+        cost, length = self.episodes.expected_cost, self.episodes.episode_length
         what = f"The multiplier has been at its upper bound {self.upper_bound} for {PATIENCE} updates"
         if self.episodes.seen >= ENOUGH_ROAD and cost > self.cost_limit:
             remedy = "looks infeasible: allow more, or make sure that some behaviour could keep it"
-            self._warn("limit", f"{what}, and an episode still costs {cost:.3g}: cost_limit={self.cost_limit} {remedy}.")
+            worse = f"and an episode of {length:.0f} steps still costs {cost:.3g}"
+            self._warn("limit", f"{what}, {worse}: cost_limit={self.cost_limit} {remedy}.")
         elif "limit" not in self._warn:
             remedy = f"the critics expect {self.calibration:.2g} times what came: learn more often, or raise the bound"
-            self._warn("bound", f"{what} though an episode costs {cost:.3g} of {self.cost_limit} allowed; {remedy}.")
+            better = f"though an episode of {length:.0f} steps costs {cost:.3g} of {self.cost_limit} allowed"
+            self._warn("bound", f"{what} {better}; {remedy}.")
 
     def _watch_critics(self, gradient_steps: int) -> None:
         low, high = self.calibration_band[0] / BLINDNESS, self.calibration_band[1] * BLINDNESS
