@@ -99,14 +99,14 @@ def step_time(model: OffPolicyAlgorithm, steps: int) -> float:
 
     :param model: algorithm whose warm-up is over
     :param steps: how many
-    :return: wall-clock of one of them [s]
+    :return: processor time of one of them [s]
     """
     model.set_logger(configure(None, []))
     model.learn(200)
     model._n_updates = 1  # from then on the cost critics are asked about every step
-    start = time.perf_counter()
+    start = time.process_time()
     model.learn(steps, reset_num_timesteps=False)
-    return (time.perf_counter() - start) / steps
+    return (time.process_time() - start) / steps
 
 
 def measure_steps(steps: int, repeats: int) -> None:
