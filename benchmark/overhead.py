@@ -156,16 +156,17 @@ def measure_memory(steps: int, every: int) -> None:
 
 
 def main() -> None:
-    """Measure memory, then time."""
+    """Measure time, then memory."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--memory-steps", type=int, default=20_000)
+    parser.add_argument("--memory-steps", type=int, default=20_000, help="0 for times only")
     parser.add_argument("--every", type=int, default=1000)
     parser.add_argument("--steps", type=int, default=3000)
     parser.add_argument("--repeats", type=int, default=5)
     args = parser.parse_args()
     th.set_num_threads(1)
     measure_steps(args.steps, args.repeats)
-    measure_memory(args.memory_steps, args.every)
+    if args.memory_steps:
+        measure_memory(args.memory_steps, args.every)
 
 
 if __name__ == "__main__":

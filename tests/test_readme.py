@@ -1,4 +1,4 @@
-"""The Python of the README and of docs/watching.md runs, in a few steps; its commands are understood, its links lead somewhere."""
+"""The Python of README and docs/watching.md runs, in a few steps; commands are understood, links lead somewhere."""
 
 import re
 import shlex
