@@ -29,7 +29,7 @@ from sb3_esad.watching import WatchCallback
 
 ENV_ID = "esad-highway-vector-v0"
 SMALL = {"net_arch": [32], "memory_channels": 32, "latent_channels": 8}
-SPACES = {
+SPACES: dict[str, gym.spaces.Box] = {
     "MlpPolicy": gym.spaces.Box(-1, 1, (32,), np.float32),
     "CnnPolicy": gym.spaces.Box(0, 255, (3, 64, 64), np.uint8),
 }

@@ -119,6 +119,8 @@ def _at(observations: PyTorchObs, step: int) -> PyTorchObs:
 
 def _append(before: PyTorchObs, after: PyTorchObs) -> PyTorchObs:
     """The first observation and all that followed, of shape (L + 1, ...)."""
-    if isinstance(before, dict) and isinstance(after, dict):
+    if isinstance(before, dict):
+        assert isinstance(after, dict)
         return {key: th.cat([before[key][:1], after[key]]) for key in before}
+    assert isinstance(after, th.Tensor)
     return th.cat([before[:1], after])

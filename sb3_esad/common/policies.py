@@ -143,7 +143,7 @@ class LatentPolicy(BasePolicy):
         :param mode: whether it learns
         """
         for network in (self.world_model, self.actor, self.critic, self.cost_critic):
-            if network.training != mode:  # to go through all layers takes longer than all else that is done for a step
+            if network.training != mode:  # to go through all layers takes as long as all else that is done for a step
                 network.train(mode)
         self.training = mode
 
