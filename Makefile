@@ -46,5 +46,5 @@ benchmark: .venv/.tests
 .venv-lowest/.done: setup.cfg constraints-lowest.txt
 	$(PYTHON) -m venv .venv-lowest
 	.venv-lowest/bin/python -m pip install --quiet --no-compile --constraint constraints-lowest.txt \
-		--editable ".[demo,watch]" pytest pytest-xdist hypothesis
+		--editable ".[demo,watch]" pytest pytest-xdist hypothesis moviepy
 	@touch $@
