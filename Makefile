@@ -3,7 +3,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 TOO_OLD := "sb3_esad needs Python 3.10 or newer, $(PYTHON) is %d.%d; choose another with make PYTHON=python3.11"
 
-.PHONY: demo test lint type format benchmark docs
+.PHONY: demo test test-lowest lint type format benchmark docs
 
 # Train briefly, evaluate and print the metrics.
 demo: .venv/.demo
@@ -12,6 +12,10 @@ demo: .venv/.demo
 # Two workers, for the tests are many and small; tests/conftest.py gives each of them one thread.
 test: .venv/.tests
 	$(BIN)/python -m pytest -n 2
+
+# With the lowest versions that setup.cfg admits, without RL Zoo, whose lowest version is the one in constraints.txt.
+test-lowest: .venv-lowest/.done
+	.venv-lowest/bin/python -m pytest -n 2 $(addprefix --ignore=tests/,test_benchmark.py test_hub.py test_zoo.py test_zoo_upstream.py)
 
 lint: .venv/.tests
 	$(BIN)/ruff check .
@@ -29,6 +33,7 @@ benchmark: .venv/.tests
 	$(BIN)/python benchmark/scenario_speed.py
 	$(BIN)/python benchmark/update_speed.py
 	$(BIN)/python benchmark/predict_latency.py
+	$(BIN)/python benchmark/overhead.py --memory-steps 0
 
 # The site; warnings are errors, for most of them are links that lead nowhere. Docstrings are read from the code beside it.
 docs: .venv/.docs
@@ -41,4 +46,10 @@ docs: .venv/.docs
 	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 10) or sys.exit($(TOO_OLD) % sys.version_info[:2])'
 	$(PYTHON) -m venv .venv
 	$(BIN)/python -m pip install --quiet --no-compile --constraint constraints.txt --editable ".[$(@:.venv/.%=%)]"
+	@touch $@
+
+.venv-lowest/.done: setup.cfg constraints-lowest.txt
+	$(PYTHON) -m venv .venv-lowest
+	.venv-lowest/bin/python -m pip install --quiet --no-compile --constraint constraints-lowest.txt \
+		--editable ".[demo,watch]" pytest pytest-xdist hypothesis moviepy
 	@touch $@

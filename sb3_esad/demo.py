@@ -18,7 +18,7 @@ from sb3_esad.driving_evaluation import check_scenario, evaluate_driver, evaluat
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.hyperparams import load_hyperparams
 from sb3_esad.plots import plot_learning_curve
-from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar
+from sb3_esad.progress import Deadline, EpisodeProgressBar
 from sb3_esad.report import Figures, format_table, summarise_any
 from sb3_esad.video import check_image, record_model, video_writer
 
@@ -87,12 +87,13 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     hyperparams = load_hyperparams(ESADLEND, "esad_lend", env_id)
     arguments = {**hyperparams.arguments, **FEW_UPDATES}
     model = ESADLEND(env=make_vec_env(env_id, hyperparams.n_envs), seed=seed, **arguments)
-    history = EpisodeHistory()
+    bar = EpisodeProgressBar()
     print(f"Training ESAD-LEND on {env_id} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
     start = time.monotonic()
-    model.learn(timesteps, callback=[history, EpisodeProgressBar(history), Deadline(minutes)])
+    model.learn(timesteps, callback=[bar, Deadline(minutes)])
     took = (time.monotonic() - start) / 60
     model.save(folder / "esad_lend.zip")
+    history = bar.history
     plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)
     clock = "" if model.num_timesteps >= timesteps else ", ended by the clock"
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"

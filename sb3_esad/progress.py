@@ -14,7 +14,7 @@ class TrainingEpisode(NamedTuple):
     An episode of the training.
 
     :param step: environment steps of the training when it ended
-    :param total_reward: its return
+    :param total_reward: its return, nan in environments without a ``Monitor``
     :param cost: what it has cost
     :param driving_score: in %, nan outside driving scenarios
     """
@@ -26,7 +26,7 @@ class TrainingEpisode(NamedTuple):
 
 
 class EpisodeHistory(BaseCallback):
-    """Collects what became of the episodes of a training in ``episodes``; it needs a ``Monitor``, which SB3 adds by itself."""
+    """Collects what became of the episodes of a training in ``episodes``."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -41,7 +41,8 @@ class EpisodeHistory(BaseCallback):
         for over in self._costs.add(self._read_costs(infos), self.locals["dones"]):
             info = infos[over.env]
             score = 100 * info.get("driving", {}).get("driving_score", np.nan)
-            self.episodes.append(TrainingEpisode(self.num_timesteps, info["episode"]["r"], over.cost, score))
+            total = info.get("episode", {}).get("r", np.nan)
+            self.episodes.append(TrainingEpisode(self.num_timesteps, total, over.cost, score))
         return True
 
     def recent(self, count: int = 20) -> TrainingEpisode | None:
@@ -57,19 +58,31 @@ class EpisodeHistory(BaseCallback):
 
 class EpisodeProgressBar(ProgressBarCallback):
     """
-    SB3's progress bar, which also shows the means of the latest training episodes.
+    SB3's progress bar, which also shows the mean cost of the latest training episodes, and how well they went.
 
-    :param history: collects the episodes; it must run before this callback
+    ``history`` holds the episodes, as an :class:`EpisodeHistory`.
+
+    :raises ImportError: if tqdm or rich is missing
     """
 
-    def __init__(self, history: EpisodeHistory) -> None:
+    def __init__(self) -> None:
         super().__init__()
-        self.history = history
+        self.history = EpisodeHistory()
+
+    def _init_callback(self) -> None:
+        self.history.init_callback(self.model)
+
+    def _on_training_start(self) -> None:
+        super()._on_training_start()
+        self.history.on_training_start(self.locals, self.globals)
 
     def _on_step(self) -> bool:
+        self.history.on_step()
         recent = self.history.recent()
         if recent is not None:
-            self.pbar.set_description(f"driving score {recent.driving_score:.0f} %, cost {recent.cost:.2f}", refresh=False)
+            driving = not np.isnan(recent.driving_score)
+            success = f"driving score {recent.driving_score:.0f} %" if driving else f"return {recent.total_reward:.4g}"
+            self.pbar.set_description(f"{success}, cost {recent.cost:.2f}", refresh=False)
         return super()._on_step()
 
 

@@ -14,6 +14,7 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 LAYERS = [
     "common.type_aliases common.functional common.transforms common.torch_layers common.target_networks common.optimizers",
     "common.precision common.checks common.memory common.schedules common.side_by_side common.noise",
+    "common.log_keys common.warn_once common.image_watch",
     "common.plain_values common.plain_zip common.numpy_state",
     "common.costs common.six_values common.frames common.windows common.cost_buffers common.buffers",
     "common.recent_sums",
@@ -30,7 +31,8 @@ LAYERS = [
     "common.recurrent_algorithm common.latent_algorithm common.constrained_algorithm",
     "esad_lend dreamer latent_sw_ppo wcsac envs",
     "",  # the package itself, which re-exports
-    "driving_evaluation report dream explanation panels progress hyperparams algorithms",
+    "driving_evaluation report dream explanation panels progress hyperparams algorithms film",
+    "watching",
     "moments plots",
     "video",
     "demo zoo benchmark",

@@ -148,7 +148,7 @@ def test_several_environments_and_logs() -> None:
     logged = record_logs(model)
     model.learn(60, log_interval=1)
     assert model.penalty.n_observed == 60 - 12
-    assert {"train/lagrangian_multiplier", "train/budget", "train/cost_calibration"} <= logged.keys()
+    assert {"train/lagrangian_multiplier", "train/budget", "safety/cost_calibration"} <= logged.keys()
 
 
 class Recorder(KVWriter):

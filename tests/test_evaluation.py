@@ -23,7 +23,7 @@ from sb3_esad.envs.metrics import DrivingMetrics
 from sb3_esad.explanation import ExplainedDriver
 from sb3_esad.panels import HEIGHT, PANEL, ROW, WIDTH, Gauge, compose, paint
 from sb3_esad.plots import plot_learning_curve
-from sb3_esad.progress import Deadline, EpisodeHistory, EpisodeProgressBar, TrainingEpisode
+from sb3_esad.progress import Deadline, EpisodeProgressBar, TrainingEpisode
 from sb3_esad.report import format_table, summarise_any
 from sb3_esad.video import record_driver, record_explanation, record_model, write_video
 
@@ -312,9 +312,10 @@ def test_broken_video_leaves_nothing(tmp_path: Path) -> None:
 @pytest.mark.filterwarnings("ignore:rich is experimental")
 def test_training_is_followed(tmp_path: Path) -> None:
     model = make_model("MlpPolicy", learning_starts=10_000)
-    history = EpisodeHistory()
+    bar = EpisodeProgressBar()
+    history = bar.history
     assert history.recent() is None
-    model.learn(150, callback=[history, EpisodeProgressBar(history)])
+    model.learn(150, callback=bar)
     assert len(history.episodes) >= 2
     last = history.episodes[-1]
     assert last.step <= 150 and 0 < last.driving_score < 100

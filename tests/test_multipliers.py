@@ -119,7 +119,7 @@ def test_both_signals_move_the_multiplier() -> None:
     calibrate(penalty, 5.0)
     for _ in range(100):
         logs = penalty.update(99.0)
-    assert logs["violation_model"] == logs["violation_road"] == 1.0
+    assert logs["safety/violation_model"] == logs["safety/violation_road"] == 1.0
     assert penalty.multiplier.item() == pytest.approx(2.0, abs=1e-4)
     for _ in range(48):
         penalty.update(th.tensor(99.0), gradient_steps=101)
@@ -136,7 +136,7 @@ def test_at_the_allowed_rate_the_signal_of_the_road_has_no_direction() -> None:
         for step in range(150):
             last = np.full(10, step == 149)
             penalty.observe(crashes * last, last)
-        signals.append(penalty.update(0.0)["violation_road"])
+        signals.append(penalty.update(0.0)["safety/violation_road"])
     assert np.mean(signals[20:]) == pytest.approx(0.0, abs=0.1)
     single_crash = 150 / 3000 / 0.5  # in the two episodes of each environment that are remembered
     assert min(signals) == pytest.approx(-0.05 / single_crash, abs=0.05) and max(signals[20:]) == 1.0
@@ -227,7 +227,7 @@ def test_disagreement_holds_the_multiplier(violation: float) -> None:
     calibrate(penalty, 0.0)
     for _ in range(1000):
         logs = penalty.update(violation)
-    assert (logs["violation_model"], logs["violation_road"]) == (violation, -1.0)
+    assert (logs["safety/violation_model"], logs["safety/violation_road"]) == (violation, -1.0)
     assert penalty.multiplier.item() == 1.0
     assert penalty.mean_violation.item() == pytest.approx((violation - 1.0) / 2, abs=1e-3)
 
@@ -246,16 +246,16 @@ def test_steps_scale_with_gradient_steps() -> None:
 
 def test_uncalibrated_critics_have_no_vote() -> None:
     penalty = make_penalty()
-    assert "violation_model" not in penalty.update(1.0)
+    assert "safety/violation_model" not in penalty.update(1.0)
     observe_episodes(penalty, cost=0.0)
     assert not penalty.calibrated
     penalty.note_prediction(th.full((3,), 99.0))
     assert penalty.calibration == pytest.approx(100.0) and not penalty.calibrated
-    assert "violation_model" not in penalty.update(1.0)
+    assert "safety/violation_model" not in penalty.update(1.0)
     for _ in range(21):
         penalty.note_prediction(th.zeros(3))
         observe_episodes(penalty, cost=0.0, n=1)
-    assert penalty.calibrated and penalty.update(1.0)["violation_model"] == 1.0
+    assert penalty.calibrated and penalty.update(1.0)["safety/violation_model"] == 1.0
 
 
 def test_few_episodes_have_no_vote() -> None:
@@ -263,10 +263,10 @@ def test_few_episodes_have_no_vote() -> None:
     observe_episodes(penalty, cost=9.0, n=18)
     penalty.note_prediction(th.tensor([9.0]))
     assert not penalty.calibrated
-    assert "violation_road" not in penalty.update(1.0)
+    assert "safety/violation_road" not in penalty.update(1.0)
     assert penalty.multiplier.item() == 1.0 and penalty.mean_violation.item() == 0.0
     observe_episodes(penalty, cost=9.0, n=10)
-    assert penalty.update(1.0)["violation_road"] == 1.0
+    assert penalty.update(1.0)["safety/violation_road"] == 1.0
 
 
 def test_warm_up_and_missing_updates_hold_the_multiplier() -> None:
@@ -341,18 +341,78 @@ def test_another_number_of_environments() -> None:
 
 
 def test_warns_once_at_the_upper_bound() -> None:
-    penalty = make_penalty(lagrangian_multiplier_init=50.0)
+    penalty = make_penalty(lagrangian_multiplier_init=50.0, episode_length=1)
     calibrate(penalty, 5.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(499):
             penalty.update(1.0)
-    with pytest.warns(UserWarning, match="upper bound 50.0: cost_limit=1.0 cannot be met"):
+    with pytest.warns(UserWarning, match="bound 50.0 for 500 .* still costs 5: cost_limit=1.0 looks infeasible"):
         penalty.update(1.0)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for _ in range(600):
             penalty.update(1.0)
+
+
+def test_a_multiplier_at_its_bound_is_no_infeasible_limit_where_the_road_is_content() -> None:
+    penalty = make_penalty(lagrangian_multiplier_init=50.0, episode_length=1)
+    calibrate(penalty, 0.5)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(499):
+            penalty.update(1.0)
+    with pytest.warns(UserWarning, match=r"bound 50.0 for 500 updates though an episode of 1 steps costs 0.5 of 1.0 allowed;"):
+        penalty.update(1.0)
+    observe_episodes(penalty, cost=5.0)
+    penalty.note_prediction(th.full((100,), 5.0))
+    with pytest.warns(UserWarning, match="an episode of 1 steps still costs 5: cost_limit=1.0 looks infeasible"):
+        penalty.update(1.0)
+
+
+def test_a_high_multiplier_below_its_bound_is_no_reason_to_warn() -> None:
+    penalty = make_penalty(lagrangian_multiplier_init=49.0, lambda_lr=0.0)
+    calibrate(penalty, 5.0)
+    for _ in range(1000):
+        penalty.update(1.0)
+
+
+@pytest.mark.parametrize(("expected", "came"), [(0.0, 20.0), (20.0, 0.0)])
+def test_warns_once_of_blind_critics(expected: float, came: float) -> None:
+    """Costs happen and next to nothing is expected, or the reverse."""
+    penalty = make_penalty()
+    observe_episodes(penalty, came)
+    penalty.note_prediction(th.full((4,), expected))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(499):
+            penalty.update(-1.0)
+    with pytest.warns(UserWarning, match=f"500 updates the cost critics have expected {expected:.3g} where {came:.3g} came"):
+        penalty.update(-1.0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(600):
+            penalty.update(-1.0)
+
+
+@pytest.mark.parametrize(("expected", "came", "episodes"), [(1.0, 5.0, 50), (20.0, 3.0, 50), (0.0, 0.0, 50), (0.0, 5.0, 19)])
+def test_critics_that_are_a_little_off_or_not_judged_yet_are_not_blind(expected: float, came: float, episodes: int) -> None:
+    penalty = make_penalty()
+    observe_episodes(penalty, came, n=episodes)
+    penalty.note_prediction(th.full((4,), expected))
+    for _ in range(1000):
+        penalty.update(-1.0)
+
+
+def test_critics_that_see_now_and_then_are_not_blind() -> None:
+    penalty = make_penalty()
+    for _ in range(4):
+        observe_episodes(penalty, cost=20.0)
+        penalty.note_prediction(th.zeros(4))
+        for _ in range(400):
+            penalty.update(-1.0)
+        penalty.note_prediction(th.full((400,), 20.0))
+        penalty.update(-1.0)
 
 
 def test_state_dict_round_trip() -> None:

@@ -94,7 +94,8 @@ def test_memory_of_the_environment_is_not_saved(tmp_path: Path) -> None:
     model.save(tmp_path / "model")
     data, _, _ = load_from_zip_file(tmp_path / "model")
     assert data is not None
-    scratch = {"_last_latent", "_random_actions", "_episode_costs", "_violations", "_selections", "replay_buffer"}
+    runs = {"_last_latent", "_random_actions", "_episode_costs", "_images", "_violations", "last_risk", "_selections"}
+    scratch = {*runs, "replay_buffer"}
     assert not data.keys() & {*scratch, "policy", "penalty", "entropy"}
     assert {"cost_limit", "ent_coef", "imagination_horizon", "total_cost"} <= data.keys()
     with warnings.catch_warnings():

@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import torch as th
 from gymnasium import spaces
+from stable_baselines3.common.type_aliases import TensorDict
 from stable_baselines3.common.vec_env import VecNormalize
 
 from sb3_esad.common.checks import require
@@ -111,6 +112,26 @@ class SequenceReplayBuffer(CostBuffer):
         if self.full:
             steps = (steps + self.pos) % self.buffer_size
         return self._get_sequences(steps, envs[:, None], n_events, recent, env)
+
+    def latest_episode(
+        self, length: int, env: VecNormalize | None = None
+    ) -> tuple[th.Tensor | TensorDict, th.Tensor | TensorDict, th.Tensor] | None:
+        """
+        Give the opening of the episode that began last among those that have ended.
+
+        :param length: L, steps at most
+        :param env: normalises observations
+        :return: observations, those that followed, of shape (L, ...), and the actions between them, in [-1, 1], of shape
+            (L, A); None if no whole episode is stored
+        """
+        order = np.arange(self.size()) if not self.full else (np.arange(self.size()) + self.pos) % self.buffer_size
+        openings = [np.flatnonzero(starts) for starts in self.episode_starts[order].T]
+        whole = [(each[-2], each[-1], env_index) for env_index, each in enumerate(openings) if len(each) > 1]
+        if not whole:
+            return None
+        begin, end, env_index = max(whole)
+        steps, envs = order[begin : min(end, begin + length)], np.array(env_index)
+        return *self._read_observations(steps, envs, env), self.to_torch(self.actions[steps, envs], copy=False)
 
     def _events_in_order(self) -> np.ndarray:
         """(size, n_envs) bool, oldest step first; a young buffer is rolled once around."""

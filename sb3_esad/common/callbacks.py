@@ -10,6 +10,7 @@ from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_esad.common.evaluation import evaluate_policy
+from sb3_esad.common.log_keys import key_of
 from sb3_esad.common.save_util import whole_file
 
 
@@ -65,7 +66,7 @@ class LagrangeCallback(BaseCallback):
 
     def _on_rollout_end(self) -> None:
         for name, value in self.model.penalty.update(*self.model.take_violation()).items():
-            self.logger.record(f"train/{name}", value)
+            self.logger.record(key_of(name), value)
 
 
 RESULTS = ("last_mean_reward", "last_mean_cost", "best_mean_reward", "best_mean_cost", "_best_score")

@@ -14,6 +14,8 @@ from sb3_esad.common.checkpoints import Progress, read_checkpoint, resume_callba
 from sb3_esad.common.checks import refuse_blank_images, require
 from sb3_esad.common.cost_buffers import CostBuffer, CostReplayBuffer
 from sb3_esad.common.costs import EpisodeCosts
+from sb3_esad.common.image_watch import ImageWatch
+from sb3_esad.common.log_keys import key_of
 from sb3_esad.common.memory import keep_freed_memory
 from sb3_esad.common.whole_files import WholeFiles
 
@@ -59,6 +61,7 @@ class CostAwareAlgorithm(WholeFiles):
         self.replay_buffer_kwargs = {**self.replay_buffer_kwargs, **own}
         super()._setup_model()
         self._episode_costs = EpisodeCosts()
+        self._images = ImageWatch(self.observation_space, self.policy.normalize_images)
 
     def learn(
         self: SelfCostAware,
@@ -139,6 +142,7 @@ class CostAwareAlgorithm(WholeFiles):
         dones: np.ndarray,
         infos: list[dict[str, Any]],
     ) -> None:
+        self._images.observe(self._last_obs, new_obs)
         super()._store_transition(replay_buffer, buffer_action, new_obs, reward, dones, infos)
         self._last_episode_starts = dones  # SB3 forgets which episodes have just begun
 
@@ -170,7 +174,7 @@ class CostAwareAlgorithm(WholeFiles):
         """Log the means of what the updates have brought."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in logs.items():
-            self.logger.record(f"train/{name}", float(np.mean(values)))
+            self.logger.record(key_of(name), float(np.mean(values)))
 
     def _setup_learn(
         self,
@@ -199,4 +203,4 @@ class CostAwareAlgorithm(WholeFiles):
         return result
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "_episode_costs", "_interrupted"]
+        return [*super()._excluded_save_params(), "_episode_costs", "_images", "_interrupted"]

@@ -81,6 +81,7 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         super()._setup_model()
         self.penalty = self._make_penalty().to(self.device)
         self._violations: list[th.Tensor] = []
+        self.last_risk: th.Tensor | None = None
 
     def _make_penalty(self, **further: Any) -> Penalty:
         penalty_class = NoPenalty if self.cost_limit is None else self.penalty_class
@@ -143,6 +144,7 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         self, learning_starts: int, action_noise: ActionNoise | None = None, n_envs: int = 1
     ) -> tuple[np.ndarray, np.ndarray]:
         actions, buffer_actions = super()._sample_action(learning_starts, action_noise, n_envs)
+        self.last_risk = None
         if self._n_updates > 0 and self.num_timesteps >= learning_starts:
             self._note_risk(th.as_tensor(buffer_actions, dtype=th.float32, device=self.device).flatten(1))
         return actions, buffer_actions
@@ -151,8 +153,8 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
     def _note_risk(self, actions: th.Tensor) -> None:
         """Note what the critics expect where the policy really is: replayed states are those of policies that are gone."""
         means, variance = self.policy.cost_critic_target(self._last_state(), actions)
-        risk = self.policy.cost_critic_target.risk(means, variance, self.risk_level)
-        self._violations.append(risk.mean() - self.penalty.budget)
+        self.last_risk = self.policy.cost_critic_target.risk(means, variance, self.risk_level)
+        self._violations.append(self.last_risk.mean() - self.penalty.budget)
         self.penalty.note_prediction(means.mean(0))
 
     def risk(self, states: PyTorchObs, actions: th.Tensor) -> th.Tensor:
@@ -183,4 +185,4 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
         return [*names, "penalty"], variables
 
     def _excluded_save_params(self) -> list[str]:
-        return [*super()._excluded_save_params(), "penalty", "_violations"]
+        return [*super()._excluded_save_params(), "penalty", "_violations", "last_risk"]

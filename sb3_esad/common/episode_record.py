@@ -114,9 +114,17 @@ class EpisodeRecord(nn.Module):
         :param epsilon: > 0, added to both, so that rare costs do not make the ratio jump
         :return: the ratio, 1 as long as there is neither
         """
-        predicted = self.recent["predicted"] / max(self.recent["predictions"], 1.0)
-        observed = self.recent["costs_to_come"] / max(self.recent["steps"], 1.0)
-        return (predicted + epsilon) / (observed + epsilon)
+        return (self.predicted + epsilon) / (self.observed + epsilon)
+
+    @property
+    def predicted(self) -> float:
+        """Mean discounted cost to come that has lately been expected."""
+        return self.recent["predicted"] / max(self.recent["predictions"], 1.0)
+
+    @property
+    def observed(self) -> float:
+        """Mean discounted cost to come of the steps lately made, as far as it has come."""
+        return self.recent["costs_to_come"] / max(self.recent["steps"], 1.0)
 
     @property
     def _steps_of_episodes(self) -> float:

@@ -11,6 +11,7 @@ from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.checks import require
+from sb3_esad.common.log_keys import grouped
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
@@ -116,7 +117,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
             following = self._sample(batch_size)
             learn, fit = partial(self._learn_behavior, samples, filtered), self._fitting(following)
             behavior_logs, (next_filtered, next_logs) = side_by_side(learn, fit, self.device)
-            next_logs["model_grad_norm"] = self._move("world_model")
+            next_logs["world_model/grad_norm"] = self._move("world_model")
             yield {**model_logs, **behavior_logs}
             samples, filtered, model_logs = following, next_filtered, next_logs
         yield {**model_logs, **self._learn_behavior(samples, filtered)}
@@ -141,7 +142,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
 
     def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
         filtered, logs = self._fitting(samples)()
-        logs["model_grad_norm"] = self._move("world_model")
+        logs["world_model/grad_norm"] = self._move("world_model")
         return filtered, logs
 
     def _fitting(self, samples: SequenceSamples) -> Callable[[], tuple[Filtered, Logs]]:
@@ -152,7 +153,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
             with autocast(self.device):
                 loss, filtered, logs = self.policy.world_model.loss(samples, generator)
             self._differentiate("world_model", loss)
-            return filtered.detach(), logs
+            return filtered.detach(), grouped("world_model", logs)
 
         return fit
 

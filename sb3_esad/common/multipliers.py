@@ -1,7 +1,6 @@
 """What a violated cost limit costs the policy, by an augmented Lagrangian."""
 
 import math
-import warnings
 
 import numpy as np
 import torch as th
@@ -9,13 +8,17 @@ import torch as th
 from sb3_esad.common.checks import require
 from sb3_esad.common.episode_record import EpisodeRecord
 from sb3_esad.common.functional import discounted_budget, tail_factor
+from sb3_esad.common.log_keys import grouped
 from sb3_esad.common.penalties import Penalty
 from sb3_esad.common.type_aliases import Logs
+from sb3_esad.common.warn_once import WarnOnce
 
 ENOUGH_ROAD = 0.2
 """How much of the latest steps must have been driven before their cost rate has a say."""
 PATIENCE = 500
-"""Updates at the upper bound after which the user is warned."""
+"""Updates for which the multiplier must have been at its upper bound, or the critics blind, before the user is warned."""
+BLINDNESS = 3.0
+"""How far beyond the band of calibration critics are not only mistrusted, but called blind."""
 
 
 class AugmentedLagrangian(Penalty):
@@ -92,7 +95,8 @@ class AugmentedLagrangian(Penalty):
         self.register_buffer("mean_violation", th.zeros(()))
         self.register_buffer("n_updates", th.zeros(()))
         self.register_buffer("updates_at_bound", th.zeros(()))
-        self._warned = False
+        self._updates_blind = 0
+        self._warn = WarnOnce()
 
     @property
     def budget(self) -> float:
@@ -155,6 +159,7 @@ class AugmentedLagrangian(Penalty):
             self._move(list(signals.values()), gradient_steps)
         self.n_updates += gradient_steps
         self._watch_bound(gradient_steps)
+        self._watch_critics(gradient_steps)
         return {**self._logs(signals), "cvar": float(violation) + self.budget}
 
     def _signals(self, violation: float) -> Logs:
@@ -178,17 +183,36 @@ class AugmentedLagrangian(Penalty):
 
     def _watch_bound(self, gradient_steps: int) -> None:
         self.updates_at_bound.add_(gradient_steps).mul_(self.multiplier >= self.upper_bound)
-        if self.updates_at_bound >= PATIENCE and not self._warned:
-            self._warned = True
-            cause = f"cost_limit={self.cost_limit} cannot be met, or the cost critics are off by {self.calibration:.2f}"
-            warnings.warn(f"The multiplier stays at its upper bound {self.upper_bound}: {cause}.", stacklevel=2)
+        if self.updates_at_bound < PATIENCE:
+            return
+        cost, length = self.episodes.expected_cost, self.episodes.episode_length
+        what = f"The multiplier has been at its upper bound {self.upper_bound} for {PATIENCE} updates"
+        if self.episodes.seen >= ENOUGH_ROAD and cost > self.cost_limit:
+            remedy = "looks infeasible: allow more, or make sure that some behaviour could keep it"
+            worse = f"and an episode of {length:.0f} steps still costs {cost:.3g}"
+            self._warn("limit", f"{what}, {worse}: cost_limit={self.cost_limit} {remedy}.")
+        elif "limit" not in self._warn:
+            remedy = f"the critics expect {self.calibration:.2g} times what came: learn more often, or raise the bound"
+            better = f"though an episode of {length:.0f} steps costs {cost:.3g} of {self.cost_limit} allowed"
+            self._warn("bound", f"{what} {better}; {remedy}.")
+
+    def _watch_critics(self, gradient_steps: int) -> None:
+        low, high = self.calibration_band[0] / BLINDNESS, self.calibration_band[1] * BLINDNESS
+        judged = self._enough_episodes and self.episodes.has_prediction and self.episodes.seen >= ENOUGH_ROAD
+        blind = judged and not low <= self.calibration <= high
+        self._updates_blind = (self._updates_blind + gradient_steps) * blind
+        if self._updates_blind >= PATIENCE:
+            expected, came = self.episodes.predicted, self.episodes.observed
+            what = f"For {PATIENCE} updates the cost critics have expected {expected:.3g} where {came:.3g} came"
+            remedy = "learn more often (gradient_steps), or make sure that what leads to a cost can be observed"
+            self._warn("critics", f"{what}, in discounted cost to come: {remedy}.")
 
     def _logs(self, signals: Logs) -> Logs:
         return {
             "lagrangian_multiplier": self.multiplier.item(),
-            "penalty_weight": self.base_weight.item(),
             "budget": self.budget,
-            "cost_calibration": self.calibration,
-            "horizon": self.episodes.episode_length,
-            **signals,
+            "safety/penalty_weight": self.base_weight.item(),
+            "safety/cost_calibration": self.calibration,
+            "safety/horizon": self.episodes.episode_length,
+            **grouped("safety", signals),
         }

@@ -142,7 +142,8 @@ class LatentPolicy(BasePolicy):
         :param mode: whether it learns
         """
         for network in (self.world_model, self.actor, self.critic, self.cost_critic):
-            network.train(mode)
+            if network.training != mode:  # to go through all layers takes as long as all else that is done for a step
+                network.train(mode)
         self.training = mode
 
     @property

@@ -119,8 +119,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         return {
             "critic_loss": dreamed.item(),
             "replay_critic_loss": anchored.item(),
-            "imagined_return": targets[0].mean().item(),
-            "imagined_reward": imagined.predictions.rewards.mean().item(),
+            "imagination/return": targets[0].mean().item(),
+            "imagination/reward": imagined.predictions.rewards.mean().item(),
         }
 
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
@@ -138,7 +138,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
             "cost_critic_loss": (weights * mean_loss).mean().item(),
             "cost_var_loss": (weights * variance_loss).mean().item(),
             "replay_cost_critic_loss": anchor_mean_loss.mean().item(),
-            "imagined_cost": targets.means[0].mean().item(),
+            "imagination/cost": targets.means[0].mean().item(),
         }
 
     def _update_actor(self, imagined: Imagination) -> Logs:
@@ -158,8 +158,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         usual_risk = risk[0, : risk.shape[1] // 2]  # the other half starts shortly before a cost
         return {
             "actor_loss": loss.item(),
-            "imagined_risk": usual_risk.mean().item(),
-            "barrier_residual": barrier.relu().mean().item(),
+            "imagination/risk": usual_risk.mean().item(),
+            "imagination/barrier_residual": barrier.relu().mean().item(),
             "entropy": -log_prob.mean().item(),
             "return_scale": self.policy.critic.scale.item(),
             **self.entropy.update(log_prob.detach()),

@@ -138,7 +138,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         risk = capped_cvar(means, variance, self.risk_level, math.inf).max(0).values[:, None]
         loss = self.penalty.combine(entropy_term - value, risk, th.zeros_like(risk)).mean()
         _minimize(loss, self.actor.optimizer)
-        return {"actor_loss": loss.item(), "replayed_risk": risk.mean().item()}
+        return {"actor_loss": loss.item(), "safety/replayed_risk": risk.mean().item()}
 
     def _last_state(self) -> PyTorchObs:
         assert self._last_obs is not None
