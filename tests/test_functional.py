@@ -163,6 +163,23 @@ def test_expected_error_is_the_mean_of_sampled_ones() -> None:
     assert expected.item() == pytest.approx(sampled.item(), rel=0.02)
 
 
+@pytest.mark.parametrize("risk_level", [0.1, 0.5, 0.9, 1.0])
+def test_the_likelier_a_crash_the_riskier_for_the_actor(risk_level: float) -> None:
+    """A cost of 1 with probability Q has the variance Q (1 - Q)."""
+    chance = th.linspace(0.01, 0.99, 99, dtype=th.float64, requires_grad=True)
+    risk = F.rising_cvar(chance, chance * (1 - chance), risk_level)
+    (slope,) = th.autograd.grad(risk.sum(), chance)
+    assert (slope >= 1.0).all()
+    assert (risk <= chance / risk_level + 1e-12).all()
+
+
+def test_a_gaussian_would_make_sure_of_a_crash() -> None:
+    """Why the variance has no gradient: root of 1 + k (1 - 2 Q) / (2 sqrt(Q (1 - Q))) for k = .798."""
+    chance = th.tensor([0.85, 0.89, 0.895, 0.95], dtype=th.float64, requires_grad=True)
+    (slope,) = th.autograd.grad(F.gaussian_cvar(chance, chance * (1 - chance), 0.5).sum(), chance)
+    assert (slope > 0).tolist() == [True, True, False, False]
+
+
 def test_discounted_sum_is_the_first_lambda_return_for_lambda_1() -> None:
     amounts, continues, values = th.rand(3, 4, 5).unbind()
     returns = F.lambda_return(amounts.T, continues.T, values.T, 0.9, 1.0)

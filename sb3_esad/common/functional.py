@@ -58,6 +58,23 @@ def capped_cvar(mean: th.Tensor, variance: th.Tensor, risk_level: float, cost_bo
     return th.minimum(gaussian_cvar(mean, variance, risk_level), mean / risk_level).clamp(max=cost_bound)
 
 
+def rising_cvar(mean: th.Tensor, variance: th.Tensor, risk_level: float) -> th.Tensor:
+    """
+    Risk for an actor to descend: it always falls with the expected cost.
+
+    Neither does the bound of :func:`capped_cvar` hold, below which the risk is flat where the worst outcomes are all crashes,
+    so that an actor that always crashes would never learn from it to crash less often ("blindness to success", arXiv
+    2205.05138), nor has the variance a gradient. It is largest where it is open whether a crash will happen: the deviation of
+    a crash of probability Q falls faster than Q rises where Q > .89 (risk level .5), and the actor would make sure of it.
+
+    :param mean: Q^c, the expected discounted cost
+    :param variance: V^c > 0, its variance, of the shape of ``mean``
+    :param risk_level: alpha in (0, 1]
+    :return: the conditional value at risk, of the shape of ``mean``, its slope in it at least 1
+    """
+    return capped_cvar(mean, variance.detach(), risk_level, math.inf)
+
+
 def wasserstein2(mean1: th.Tensor, variance1: th.Tensor, mean2: th.Tensor, variance2: th.Tensor) -> th.Tensor:
     """
     Squared 2-Wasserstein distance of two scalar Gaussians.

@@ -1,6 +1,5 @@
 """ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
 
-import math
 from typing import Any, ClassVar
 
 import torch as th
@@ -10,7 +9,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 from sb3_esad.common.checks import require
 from sb3_esad.common.constrained_algorithm import ConstrainedLatentAlgorithm
 from sb3_esad.common.entropy import make_entropy_coefficient
-from sb3_esad.common.functional import capped_cvar
+from sb3_esad.common.functional import rising_cvar
 from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns, taken
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
@@ -168,13 +167,10 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     def _imagined_risk(self, imagined: Imagination) -> th.Tensor:
         """
         Safety measure of each imagined step, of shape (H, N); :meth:`risk`, which moves the multiplier, is the critics' own.
-
-        Where the worst outcomes are all crashes the bounded risk is flat, and an actor that always crashes would never learn
-        from it to crash less often ("blindness to success", arXiv 2205.05138): hence without the bound.
         """
         costs = imagined_costs(self.policy.cost_critic, imagined, self.discount_of_cost, self.lambda_return)
         _, variance = self.policy.cost_critic(*taken(imagined))
-        return capped_cvar(costs, variance.view_as(costs), self.risk_level, math.inf)
+        return rising_cvar(costs, variance.view_as(costs), self.risk_level)
 
     def _optimizers(self) -> dict[str, th.optim.Optimizer]:
         own = {f"entropy.{name}": getattr(self.entropy, name) for name in self.entropy.optimizer_names}

@@ -1,6 +1,5 @@
 """WCSAC and SAC-Lag: SB3's SAC within a budget of cost, the model-free controls of ESAD-LEND."""
 
-import math
 from collections import defaultdict
 from typing import Any, ClassVar
 
@@ -13,7 +12,7 @@ from torch.nn import functional as F
 from sb3_esad.common.checks import require
 from sb3_esad.common.cost_buffers import CostReplayBuffer
 from sb3_esad.common.cost_limited_algorithm import CostLimitedAlgorithm
-from sb3_esad.common.functional import capped_cvar
+from sb3_esad.common.functional import rising_cvar
 from sb3_esad.common.target_networks import update_target
 from sb3_esad.common.type_aliases import CostReplaySamples, Logs
 from sb3_esad.wcsac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, WCSACPolicy
@@ -134,8 +133,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
     def _update_actor(self, observations: PyTorchObs, actions: th.Tensor, entropy_term: th.Tensor) -> Logs:
         value = th.cat(self.critic(observations, actions), dim=1).min(dim=1, keepdim=True).values
         means, variance = self.policy.cost_critic(observations, actions)
-        # Without the bound, under which the risk would be flat wherever the worst outcomes are all crashes
-        risk = capped_cvar(means, variance, self.risk_level, math.inf).max(0).values[:, None]
+        risk = rising_cvar(means, variance, self.risk_level).max(0).values[:, None]
         loss = self.penalty.combine(entropy_term - value, risk, th.zeros_like(risk)).mean()
         _minimize(loss, self.actor.optimizer)
         return {"actor_loss": loss.item(), "safety/replayed_risk": risk.mean().item()}
