@@ -112,6 +112,13 @@ class WholeFiles(OffPolicyAlgorithm):
             loaded = self.replay_buffer
         finally:
             self.replay_buffer = own
-        refuse_other_buffer(loaded, own)
-        loaded.take_settings_of(own)
+        wanted = self._empty_buffer() if own is None else own
+        refuse_other_buffer(loaded, wanted)
+        loaded.take_settings_of(wanted)
         self.replay_buffer = loaded
+
+    def _empty_buffer(self) -> CostBuffer:
+        """What the model would begin with, where the user has dropped its buffer to free the memory."""
+        place = {"device": self.device, "n_envs": self.n_envs}
+        spaces = self.observation_space, self.action_space
+        return self.replay_buffer_class(self.buffer_size, *spaces, **place, **self.replay_buffer_kwargs)
