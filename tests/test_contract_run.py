@@ -97,7 +97,9 @@ def test_what_reset_returns_is_no_observation(algorithm: Algorithm) -> None:
 
 def drive(algorithm: Algorithm, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Learn, then act at random; what was done and earned."""
-    model = make(algorithm, env=RandomEnv(VECTOR), seed=seed, action_noise=NormalActionNoise(np.zeros(1), np.ones(1))).learn(28)
+    model = make(algorithm, env=RandomEnv(VECTOR), seed=seed, action_noise=NormalActionNoise(np.zeros(1), np.ones(1))).learn(
+        28
+    )
     env = model.get_env()
     observation, state, start, actions, rewards = env.reset(), None, None, [], []
     for _ in range(8):

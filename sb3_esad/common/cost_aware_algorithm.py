@@ -8,7 +8,7 @@ from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.type_aliases import MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import safe_mean
 
-from sb3_esad.common.checks import refuse_blank_images, require
+from sb3_esad.common.checks import refuse_blank_images, refuse_other_shapes, require
 from sb3_esad.common.cost_buffers import CostBuffer, CostReplayBuffer
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.memory import keep_freed_memory
@@ -142,6 +142,8 @@ class CostAwareAlgorithm(WholeFiles):
         assert self._last_obs is not None and self._last_episode_starts is not None
         if self._last_episode_starts.all():
             self._episode_costs.clear()
+        if self._last_original_obs is not None:
+            refuse_other_shapes(self._last_original_obs, self.observation_space)
         refuse_blank_images(self._last_obs, self.observation_space, self.policy.normalize_images)
         return result
 
