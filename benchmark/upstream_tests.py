@@ -2,17 +2,17 @@
 The tests of Stable-Baselines3 or sb3-contrib with our algorithms in the place of SAC or TQC: ``upstream_tests.py CLONE``.
 
 The tests of the clone run on the installed packages, unchanged: what they import as SAC (TQC) is an algorithm of ours, with
-small networks. Those that have no use for it are left out. Warnings are errors, but for the one about environments without
-costs. A test that does not apply has its reason below, is run as it stands, and must fail; docs/sb3_contract.md lists them.
+small networks. Those that have no use for it are left out. Warnings are errors; the one about environments without costs is
+silent. A test that does not apply has its reason below, is run as it stands, and must fail; docs/sb3_contract.md lists them.
 """
 
 import argparse
+import math
 import re
 import shutil
 import subprocess
 import sys
 import tempfile
-from fnmatch import fnmatch
 from importlib import import_module
 from pathlib import Path
 from types import CodeType
@@ -23,12 +23,14 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 
 from sb3_esad import ESADLEND
 from sb3_esad.algorithms import ALGORITHMS
+from sb3_esad.common.costs import CostReader
 
 TAKEN = {"stable_baselines3": "SAC", "sb3_contrib": "TQC"}
 """Packages, and the algorithm of each whose place is taken."""
 
 SMALL: dict[str, Any] = {
     "learning_starts": 100,  # as SAC has it: most of these tests are shorter than what ours wait for
+    "train_freq": 16,
     "batch_size": 4,
     "sequence_length": 8,
     "pretrain_steps": 1,
@@ -41,10 +43,30 @@ SMALL_POLICY: dict[str, Any] = {"net_arch": [16], "memory_channels": 8, "latent_
 OF_OTHER_NETWORKS = ("n_quantiles", "n_critics", "share_features_extractor", "features_extractor_kwargs")
 """Sizes of networks that SAC and TQC have: dropped, but for the tests that are about them."""
 
-DOES_NOT_APPLY: dict[str, str] = {}
-"""Tests by what their names begin with, and why no algorithm of ours can pass them."""
+DOES_NOT_APPLY: dict[str, str] = {
+    r"test_her\.py|test_vec_normalize\.py::test_her": "HerReplayBuffer keeps no costs, and is refused",
+    r"test_n_step_replay\.py": "n_steps is refused: cost critics learn from single steps, imagined returns mix all of them",
+    r"test_save_load\.py::test_warn_buffer\[True": "optimize_memory_usage is refused: it loses the last frames of episodes",
+    r"test_custom_policy\.py::test_custom_offpolicy\[.*net_arch0": "net_arch=[] is refused: critics have a hidden layer",
+    r"test_train_eval_mode\.py::test_(sac|tqc)_train": "tau=0 is refused: targets would not follow",
+    r"test_cnn\.py::test_features?_extractor_target": "train() called by hand waits for learning_starts stored steps",
+    r"test_tensorboard\.py": "looks for a run that is named SAC; ours are named after their class",
+}
+"""Tests by a pattern of their names, and why no algorithm of ours passes them."""
 
-DOES_NOT_APPLY_TO_LATENTS: dict[str, str] = {}
+DOES_NOT_APPLY_TO_LATENTS: dict[str, str] = {
+    r"test_sde\.py.*(True-True|True-False)|test_run\.py::test_sde|test_spaces\.py::test_sde": "gSDE is refused",
+    r"test_run\.py::test_offpolicy_multi_env": "asks for gSDE; that of sb3-contrib does not, and passes",
+    r"test_run\.py::test_n_critics": "n_critics is no argument of the policy: there are two",
+    r"test_save_load\.py::test_save_load_policy": "calls actor.predict: an actor of ours sees latent states, not observations",
+    r"test_save_load\.py::test_save_load_pytorch_var": "reads log_ent_coef; ours is a module named entropy",
+    r"test_gae\.py": "calls the critic with observations; ours sees latent states",
+    r"test_train_eval_mode\.py::.*(Pendulum|collect)": "looks for an extractor in the actor; ours is the world model's",
+    r"test_dict_env\.py::test_consistency": "the encoders of vectors and of dictionaries differ in size",
+    r"test_cnn\.py::test_image_like_input\[True": "expects an AssertionError; ours is a ValueError with a remedy",
+    r"test_spaces\.py::test_action_spaces\[CartPole": "expects an AssertionError; ours is a ValueError with a remedy",
+    r"test_identity\.py": "400 steps are too few for small networks to learn a world model and to act by it",
+}
 """The same for those that imagine."""
 
 
@@ -52,12 +74,12 @@ def reason_of(name: str, algorithm: type[BaseAlgorithm]) -> str | None:
     """
     Tell why a test does not apply.
 
-    :param name: of the test, with its parameters
+    :param name: of the test, with its file and its parameters
     :param algorithm: that is tested
     :return: None if it does
     """
     reasons = {**DOES_NOT_APPLY, **(DOES_NOT_APPLY_TO_LATENTS if issubclass(algorithm, ESADLEND) else {})}
-    return next((reason for pattern, reason in reasons.items() if fnmatch(name, pattern)), None)
+    return next((reason for pattern, reason in reasons.items() if re.search(pattern, name)), None)
 
 
 def names_in(code: CodeType) -> set[str]:
@@ -92,11 +114,13 @@ class StandIn:
                 if is_latent and not plugin.as_it_stands:
                     own = {name: value for name, value in given.items() if name not in OF_OTHER_NETWORKS}
                     kwargs, given = {**SMALL, **kwargs}, {**SMALL_POLICY, **own}
+                    kwargs["sequence_length"] = min(kwargs["sequence_length"], kwargs.get("buffer_size", math.inf))
                 super().__init__(*args, policy_kwargs=given, **kwargs)
 
         Small.__name__ = algorithm.__name__
         self.algorithm = Small
         setattr(import_module(package), self.taken, Small)
+        CostReader._warn_missing = lambda *args: None  # type: ignore[method-assign]
 
     def pytest_collection_modifyitems(self, config: pytest.Config, items: list[pytest.Function]) -> None:
         """
@@ -109,7 +133,7 @@ class StandIn:
         config.hook.pytest_deselected(items=[item for item in items if item not in ours])
         items[:] = ours
         for item in items:
-            if reason := reason_of(item.name, self.algorithm):
+            if reason := reason_of(item.nodeid, self.algorithm):
                 item.add_marker(pytest.mark.xfail(reason=reason, strict=True))
 
     def pytest_runtest_setup(self, item: pytest.Function) -> None:
@@ -118,7 +142,7 @@ class StandIn:
 
         :param item: test that is about to run
         """
-        self.as_it_stands = reason_of(item.name, self.algorithm) is not None
+        self.as_it_stands = reason_of(item.nodeid, self.algorithm) is not None
 
     def _is_meant(self, item: pytest.Function) -> bool:
         values = item.callspec.params.values() if hasattr(item, "callspec") else []
@@ -143,7 +167,7 @@ def run(clone: Path, algorithm: type[Any], further: list[str]) -> int:
         shutil.copytree(clone / "tests", Path(folder) / "tests")
         files = [str(path) for path in sorted(Path(folder).glob("tests/test_*.py")) if mentions(path, stand_in.taken)]
         options = ["-c", "/dev/null", "--rootdir", folder, "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist"]
-        warnings = ["error", "ignore:No cost:UserWarning", "ignore:rich is experimental", "ignore:Unknown pytest.mark"]
+        warnings = ["error", "ignore:rich is experimental", "ignore:Unknown pytest.mark", "ignore:.torch.jit.script_method"]
         filters = [word for each in warnings for word in ("-W", each)]
         return int(pytest.main([*options, *filters, *further, *files], plugins=[stand_in]))
 

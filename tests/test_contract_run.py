@@ -15,8 +15,8 @@ from stable_baselines3.common.noise import NormalActionNoise, VectorizedActionNo
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from tests.contract import Algorithm, every_algorithm, imagines, make
 from tests.conftest import VECTOR, CountingEnv, RandomEnv
+from tests.contract import Algorithm, every_algorithm, imagines, make
 
 
 @every_algorithm
@@ -42,7 +42,7 @@ def test_frequency_of_updates(algorithm: Algorithm, monkeypatch: pytest.MonkeyPa
 @every_algorithm
 @pytest.mark.parametrize("train_freq", ["4", ("1", "episode"), "often", (1, "day")])
 def test_frequencies_that_are_none(algorithm: Algorithm, train_freq: Any) -> None:
-    with pytest.raises(ValueError, match="train_freq|train frequency"):
+    with pytest.raises(ValueError, match=r"train_freq|train frequency"):
         make(algorithm, train_freq=train_freq)
 
 
