@@ -119,6 +119,6 @@ class WholeFiles(OffPolicyAlgorithm):
 
     def _empty_buffer(self) -> CostBuffer:
         """What the model would begin with, where the user has dropped its buffer to free the memory."""
-        place = {"device": self.device, "n_envs": self.n_envs}
-        spaces = self.observation_space, self.action_space
-        return self.replay_buffer_class(self.buffer_size, *spaces, **place, **self.replay_buffer_kwargs)
+        make: Any = self.replay_buffer_class
+        place = self.observation_space, self.action_space, self.device, self.n_envs
+        return make(self.buffer_size, *place, **self.replay_buffer_kwargs)
