@@ -57,7 +57,7 @@ DOES_NOT_APPLY: dict[str, str] = {
 
 DOES_NOT_APPLY_TO_LATENTS: dict[str, str] = {
     r"test_sde\.py.*(True-True|True-False)|test_run\.py::test_sde|test_spaces\.py::test_sde": "gSDE is refused",
-    r"test_run\.py::test_offpolicy_multi_env": "asks for gSDE; that of sb3-contrib does not, and passes",
+    r"stable_baselines3/.*::test_offpolicy_multi_env": "asks for gSDE; that of sb3-contrib does not, and passes",
     r"test_run\.py::test_n_critics": "n_critics is no argument of the policy: there are two",
     r"test_save_load\.py::test_save_load_policy": "calls actor.predict: an actor of ours sees latent states, not observations",
     r"test_save_load\.py::test_save_load_pytorch_var": "reads log_ent_coef; ours is a module named entropy",
@@ -75,7 +75,7 @@ def reason_of(name: str, algorithm: type[BaseAlgorithm]) -> str | None:
     """
     Tell why a test does not apply.
 
-    :param name: of the test, with its file and its parameters
+    :param name: of the test, with its package, its file and its parameters
     :param algorithm: that is tested
     :return: None if it does
     """
@@ -103,7 +103,7 @@ class StandIn:
     """
 
     def __init__(self, algorithm: type[Any], package: str) -> None:
-        self.taken = TAKEN[package]
+        self.package, self.taken = package, TAKEN[package]
         self.as_it_stands = False
         plugin, is_latent = self, issubclass(algorithm, ESADLEND)
 
@@ -134,7 +134,7 @@ class StandIn:
         config.hook.pytest_deselected(items=[item for item in items if item not in ours])
         items[:] = ours
         for item in items:
-            if reason := reason_of(item.nodeid, self.algorithm):
+            if reason := reason_of(f"{self.package}/{item.nodeid}", self.algorithm):
                 item.add_marker(pytest.mark.xfail(reason=reason, strict=True))
 
     def pytest_runtest_setup(self, item: pytest.Function) -> None:
@@ -146,10 +146,10 @@ class StandIn:
         self.as_it_stands = "test_n_critics" in item.name
 
     def _is_meant(self, item: pytest.Function) -> bool:
-        values = item.callspec.params.values() if hasattr(item, "callspec") else []
-        algorithms = [value for value in values if isinstance(value, type) and issubclass(value, BaseAlgorithm)]
-        by_name = self.taken.lower() in values or self.taken in names_in(item.function.__code__)
-        return self.algorithm in algorithms if algorithms else by_name
+        params = item.callspec.params if hasattr(item, "callspec") else {}
+        given = params.get("model_class", params.get("algo"))
+        by_name = self.taken.lower() in params.values() or self.taken in names_in(item.function.__code__)
+        return by_name if given is None else given is self.algorithm
 
 
 def run(clone: Path, algorithm: type[Any], further: list[str]) -> int:
