@@ -9,6 +9,7 @@ silent. A test that does not apply has its reason below, and must fail; docs/sb3
 import argparse
 import math
 import re
+import shlex
 import shutil
 import subprocess
 import sys
@@ -168,7 +169,7 @@ def run(clone: Path, algorithm: type[Any], further: list[str]) -> int:
         shutil.copytree(clone / "tests", Path(folder) / "tests")
         files = [str(path) for path in sorted(Path(folder).glob("tests/test_*.py")) if mentions(path, stand_in.taken)]
         options = ["-c", "/dev/null", "--rootdir", folder, "-q", "--tb=short", "-p", "no:cacheprovider", "-p", "no:xdist"]
-        warnings = ["error", "ignore:rich is experimental", "ignore:Unknown pytest.mark", "ignore:.torch.jit.script_method"]
+        warnings = ["error", "ignore:rich is experimental", "ignore:Unknown pytest.mark", "ignore:`torch.jit.script_method`"]
         filters = [word for each in warnings for word in ("-W", each)]
         return int(pytest.main([*options, *filters, *further, *files], plugins=[stand_in]))
 
@@ -189,13 +190,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("clone", type=Path, help="folder of a clone of Stable-Baselines3 or sb3-contrib")
     parser.add_argument("--algo", choices=ALGORITHMS, help="default: all in turn")
-    args, further = parser.parse_known_args()
+    parser.add_argument("--pytest", default="", help='words for pytest, as in --pytest="-k cnn"')
+    args = parser.parse_args()
     if args.algo:
-        sys.exit(run(args.clone, ALGORITHMS[args.algo], further))
+        sys.exit(run(args.clone, ALGORITHMS[args.algo], shlex.split(args.pytest)))
     codes = []
     for algo in ALGORITHMS:
         print(f"\n{algo}", flush=True)
-        command = [sys.executable, __file__, str(args.clone), "--algo", algo, *further]
+        command = [sys.executable, __file__, str(args.clone), "--algo", algo, f"--pytest={args.pytest}"]
         codes.append(subprocess.run(command, check=False).returncode)
     sys.exit(max(codes))
 
