@@ -1,10 +1,13 @@
 """Every script of benchmark/ starts, and says what it does."""
 
+import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from benchmark.upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_LATENTS
 
 SCRIPTS = sorted((Path(__file__).parents[1] / "benchmark").glob("*.py"))
 
@@ -13,3 +16,18 @@ SCRIPTS = sorted((Path(__file__).parents[1] / "benchmark").glob("*.py"))
 def test_help(script: Path) -> None:
     run = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, check=True)
     assert f"usage: {script.name}" in run.stdout
+
+
+def test_what_does_not_apply_is_told() -> None:
+    """In the words of the script, with the file of the test."""
+    rows = (Path(__file__).parents[1] / "docs" / "sb3_contract.md").read_text().splitlines()
+    for reasons, concerned in ((DOES_NOT_APPLY, "all"), (DOES_NOT_APPLY_TO_LATENTS, "those that imagine")):
+        for pattern, reason in reasons.items():
+            (row,) = (row for row in rows if f"| {concerned} | {reason} |" in row and names_one_of(row, pattern))
+            assert row.startswith("| `test_")
+
+
+def names_one_of(row: str, pattern: str) -> bool:
+    """Whether a row is about a test that a pattern is about."""
+    words = re.findall(r"test_[a-z_]+", pattern.replace("?", ""))
+    return any(word in row for word in words)

@@ -1,5 +1,6 @@
 """Bad arguments are refused with their value and a remedy."""
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -47,10 +48,35 @@ def refuse_blank_images(observations: np.ndarray | dict[str, np.ndarray], space:
     :raises ValueError: if each image, or each under a key, has the same value in all of its pixels
     """
     remedy = "with highway-env, unset SDL_VIDEODRIVER, whose value 'dummy' makes all images black"
-    parts = observations if isinstance(observations, dict) else {"observation": observations}
-    for key, batch in parts.items():
-        shown = space[key] if isinstance(space, spaces.Dict) else space
+    for key, batch, shown in _parts(observations, space):
         is_image = is_image_space(shown, normalized_image=not normalize_images)
         if is_image and all(np.max(image) == np.min(image) for image in batch):
             reason = f"Every pixel of the first image '{key}' is {np.max(batch[0])}, nothing can be learned from it"
             raise ValueError(f"{reason}: {remedy}.")
+
+
+def refuse_other_shapes(originals: np.ndarray | dict[str, np.ndarray], space: spaces.Space) -> None:
+    """
+    Refuse observations that ``VecNormalize`` keeps in another order of their axes than the model sees.
+
+    SB3 puts the channels of images first above all wrappers, and stores what ``VecNormalize`` has seen below.
+
+    :param originals: those that ``VecNormalize`` has seen, of all environments, or those under each key of a Dict space
+    :param space: of a single one, as the model sees it
+    :raises ValueError: if their shapes differ
+    """
+    for key, batch, shown in _parts(originals, space):
+        if batch.shape[1:] != shown.shape:
+            reason = f"VecNormalize has '{key}' of shape {batch.shape[1:]}, but the model is shown {shown.shape}"
+            raise ValueError(
+                f"{reason}: put the channels first before you normalise, by VecNormalize(VecTransposeImage(env))."
+            )
+
+
+def _parts(
+    observations: np.ndarray | dict[str, np.ndarray], space: spaces.Space
+) -> Iterator[tuple[str, np.ndarray, spaces.Space]]:
+    """Name, observations and space of each key, or of all where there are no keys."""
+    parts = observations if isinstance(observations, dict) else {"observation": observations}
+    for key, batch in parts.items():
+        yield key, batch, space[key] if isinstance(space, spaces.Dict) else space

@@ -11,7 +11,7 @@ from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, Rollout
 from stable_baselines3.common.utils import safe_mean
 
 from sb3_esad.common.checkpoints import Progress, read_checkpoint, resume_callbacks
-from sb3_esad.common.checks import refuse_blank_images, require
+from sb3_esad.common.checks import refuse_blank_images, refuse_other_shapes, require
 from sb3_esad.common.cost_buffers import CostBuffer, CostReplayBuffer
 from sb3_esad.common.costs import EpisodeCosts
 from sb3_esad.common.image_watch import ImageWatch
@@ -199,6 +199,8 @@ class CostAwareAlgorithm(WholeFiles):
         assert self._last_obs is not None and self._last_episode_starts is not None
         if self._last_episode_starts.all():
             self._episode_costs.clear()
+        if self._last_original_obs is not None:
+            refuse_other_shapes(self._last_original_obs, self.observation_space)
         refuse_blank_images(self._last_obs, self.observation_space, self.policy.normalize_images)
         return result
 

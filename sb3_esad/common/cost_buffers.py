@@ -120,7 +120,8 @@ class CostBuffer(ReplayBuffer):
         self.costs[self.pos] = costs
         self.dones[self.pos] = done
         if self.handle_timeout_termination:
-            self.timeouts[self.pos] = [info.get("TimeLimit.truncated", False) for info in infos]
+            # Arrays of one entry as well, which SB3's extend() may be given
+            self.timeouts[self.pos] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(-1)
         self.pos = (self.pos + 1) % self.buffer_size
         self.full = self.full or self.pos == 0
 

@@ -112,6 +112,13 @@ class WholeFiles(OffPolicyAlgorithm):
             loaded = self.replay_buffer
         finally:
             self.replay_buffer = own
-        refuse_other_buffer(loaded, own)
-        loaded.take_settings_of(own)
+        wanted = self._empty_buffer() if own is None else own
+        refuse_other_buffer(loaded, wanted)
+        loaded.take_settings_of(wanted)
         self.replay_buffer = loaded
+
+    def _empty_buffer(self) -> CostBuffer:
+        """What the model would begin with, where the user has dropped its buffer to free the memory."""
+        make: Any = self.replay_buffer_class
+        place = self.observation_space, self.action_space, self.device, self.n_envs
+        return make(self.buffer_size, *place, **self.replay_buffer_kwargs)
