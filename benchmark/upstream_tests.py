@@ -72,7 +72,7 @@ DOES_NOT_APPLY_TO_LATENTS: dict[str, str] = {
 """The same for those that imagine."""
 
 DOES_NOT_APPLY_TO_AD_END: dict[str, str] = {
-    r"test_save_load\.py::test_save_load\[": "takes the last parameter of each saved object; the absence of a penalty has none",
+    r"test_save_load\.py::test_save_load\[": "takes the last parameter of each saved object; its absent penalty has none",
 }
 """The same for AD-END."""
 
