@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from benchmark.upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_LATENTS
+from benchmark.upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_AD_END, DOES_NOT_APPLY_TO_LATENTS
 
 SCRIPTS = sorted((Path(__file__).parents[1] / "benchmark").glob("*.py"))
 
@@ -21,7 +21,8 @@ def test_help(script: Path) -> None:
 def test_what_does_not_apply_is_told() -> None:
     """In the words of the script, with the file of the test."""
     rows = (Path(__file__).parents[1] / "docs" / "sb3_contract.md").read_text().splitlines()
-    for reasons, concerned in ((DOES_NOT_APPLY, "all"), (DOES_NOT_APPLY_TO_LATENTS, "those that imagine")):
+    tables = {"all": DOES_NOT_APPLY, "those that imagine": DOES_NOT_APPLY_TO_LATENTS, "`ADEND`": DOES_NOT_APPLY_TO_AD_END}
+    for concerned, reasons in tables.items():
         for pattern, reason in reasons.items():
             (row,) = (row for row in rows if f"| {concerned} | {reason} |" in row and names_one_of(row, pattern))
             assert row.startswith("| `test_")
