@@ -15,7 +15,7 @@ test: .venv/.tests
 
 # With the lowest versions that setup.cfg admits, without RL Zoo, whose lowest version is the one in constraints.txt.
 test-lowest: .venv-lowest/.done
-	.venv-lowest/bin/python -m pytest -n 2 $(addprefix --ignore=tests/,test_benchmark.py test_hub.py test_zoo.py test_zoo_upstream.py)
+	.venv-lowest/bin/python -m pytest -n 2 $(addprefix --ignore=tests/,test_benchmark.py test_docs.py test_hub.py test_resuming.py test_zoo.py test_zoo_upstream.py)
 
 lint: .venv/.tests
 	$(BIN)/ruff check .

@@ -74,6 +74,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     who = parser.add_mutually_exclusive_group(required=True)
     who.add_argument("--model", type=Path, metavar="FILE.zip", help="saved model of any algorithm")
     who.add_argument("--driver", choices=DRIVERS, help="scripted driver")
+    _add_trusted(parser)
     parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
     parser.add_argument("--episodes", type=_positive, default=100, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument(
@@ -93,7 +94,7 @@ def _evaluate(args: argparse.Namespace) -> None:
         records = evaluate_driver(args.driver, args.env, seeds)
     else:
         name, how = args.model.name, "stochastic" if args.stochastic else "deterministic"
-        model = load_model(args.model)
+        model = load_model(args.model, args.trusted)
         if args.video:
             set_random_seed(args.seed)
             record_model(args.video, model, args.env, args.seed, not args.stochastic)
@@ -112,13 +113,18 @@ def _evaluate(args: argparse.Namespace) -> None:
 def _add_explain(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_explain)
     parser.add_argument("--model", type=Path, required=True, metavar="FILE.zip", help="saved model that imagines")
+    _add_trusted(parser)
     parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the episode (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("explanation.mp4"), metavar="FILE.mp4", help="(default: %(default)s)")
 
 
+def _add_trusted(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--trusted", action="store_true", help="let the model run what code its file holds")
+
+
 def _explain(args: argparse.Namespace) -> None:
-    record_explanation(args.out, load_model(args.model), args.env, args.seed)
+    record_explanation(args.out, load_model(args.model, args.trusted), args.env, args.seed)
     print(f"Written: {args.out}")
 
 

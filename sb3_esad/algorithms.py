@@ -18,13 +18,14 @@ ALGORITHMS: dict[str, type[OffPolicyAlgorithm]] = {
 }
 
 
-def load_model(path: Path) -> Any:
+def load_model(path: Path, trusted: bool = False) -> Any:
     """
     Load a saved model of any algorithm of this package.
 
     :param path: its zip
+    :param trusted: let it run what code it holds
     :return: the model
     :raises ValueError: if the file is missing, damaged, or holds something else
     """
     by_class = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
-    return by_class.get(described_class(path), ESADLEND).load(path)
+    return by_class.get(described_class(path), ESADLEND).load(path, trusted=trusted)

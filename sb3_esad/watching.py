@@ -72,7 +72,7 @@ class WatchCallback(BaseCallback):
 
     def _show_films(self, model: LatentAlgorithm) -> None:
         world_model, episode = model.policy.average.world_model, None
-        if world_model.images(self.model.observation_space.sample()):
+        if world_model.image_keys:
             episode = model.replay_buffer.latest_episode(self.length, env=model._vec_normalize_env)
         if episode is None:
             return

@@ -461,3 +461,13 @@ def test_refuses_what_it_cannot_do(kwargs: dict[str, Any], message: str) -> None
 def test_empty_buffer_says_so() -> None:
     with pytest.raises(ValueError, match="empty"):
         make_buffer(make_env()).sample(1)
+
+
+def test_a_loaded_buffer_draws_as_the_model_asks() -> None:
+    wanted, loaded = (
+        make_buffer(make_env(), length=length, event_fraction=share, recency=recency)
+        for length, share, recency in ((4, 0.25, 3.0), (8, 0.5, 0.0))
+    )
+    del loaded.recency  # as in a file of a version that had none
+    loaded.take_settings_of(wanted)
+    assert (loaded.sequence_length, loaded.event_fraction, loaded.recency) == (4, 0.25, 3.0)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
@@ -28,6 +28,7 @@ MODEL_FREE = {
     **{key: TINY[key] for key in ("learning_starts", "buffer_size", "batch_size", "device", "seed")},
     **{"policy_kwargs": {"net_arch": [16]}, "train_freq": 4},
 }
+pytestmark = pytest.mark.filterwarnings("ignore:Within save_freq")
 IDLE = {**MODEL_FREE, "learning_starts": 10_000, "train_freq": 1}
 """Nothing is learned, only steps are made."""
 TOTAL, INTERVAL, CUT = 48, 16, 34
@@ -161,7 +162,7 @@ def test_a_full_disk_is_told_once_and_costs_nothing(tmp_path: Path) -> None:
             model.learn(100, RunCheckpointCallback(20, tmp_path), reset_num_timesteps=False)
         finally:
             resource.setrlimit(resource.RLIMIT_FSIZE, limits)
-    assert len(told) == 1 and model.num_timesteps == 125
+    assert sum("No checkpoint" in str(each.message) for each in told) == 1 and model.num_timesteps == 125
     assert [path.name for path in tmp_path.iterdir()] == [CHECKPOINT]
     assert steps_of(tmp_path) == 20
     model.learn(100, RunCheckpointCallback(20, tmp_path), reset_num_timesteps=False)
@@ -220,6 +221,45 @@ def test_what_is_no_checkpoint(content: bytes | None, tmp_path: Path) -> None:
         path.write_bytes(content)
     with pytest.raises(ValueError, match="is no checkpoint, or damaged"):
         WCSAC.resume(tmp_path, CountingEnv())
+
+
+def test_a_folder_with_another_run_is_refused(folder: Path) -> None:
+    before = steps_of(folder)
+    with pytest.raises(ValueError, match=r"holds the checkpoint\.zip of another run: resume that one, choose another folder"):
+        WCSAC("MlpPolicy", CountingEnv(), **IDLE).learn(10, RunCheckpointCallback(5, folder))
+    assert steps_of(folder) == before
+
+
+def test_intervals_that_are_shorter_than_episodes_are_told(tmp_path: Path) -> None:
+    with pytest.warns(UserWarning, match="Within save_freq=20 steps of 1 environments no episode has ended"):
+        WCSAC("MlpPolicy", CountingEnv(1000), **IDLE).learn(64, RunCheckpointCallback(20, tmp_path))
+
+
+def test_statistics_of_rewards_alone(tmp_path: Path) -> None:
+    envs = [VecNormalize(one(), norm_obs=False) for _ in range(2)]
+    WCSAC("MlpPolicy", envs[0], **IDLE).learn(25, RunCheckpointCallback(20, tmp_path))
+    WCSAC.resume(tmp_path, envs[1], device="cpu")
+    assert envs[1].ret_rms.count > 10
+
+
+class Remembers(BaseCallback):
+    """Has something that no file can hold."""
+
+    def _on_step(self) -> bool:
+        return True
+
+    def state_dict(self) -> dict[str, Any]:
+        return {"array": np.zeros(2)}
+
+
+def test_what_callbacks_remember(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match="What Remembers remembers cannot be saved"):
+        WCSAC("MlpPolicy", CountingEnv(), **IDLE).learn(5, [RunCheckpointCallback(20, tmp_path), Remembers()])
+    settings = {"eval_freq": 10, "n_eval_episodes": 1, "verbose": 0, "warn": False}
+    WCSAC("MlpPolicy", one(), **IDLE).learn(25, [RunCheckpointCallback(20, tmp_path), EvalCallback(one(), **settings)])
+    resumed = EvalCallback(one(), **settings)
+    WCSAC.resume(tmp_path, one(), device="cpu").learn(25, resumed)
+    assert resumed.best_mean_reward > -np.inf and resumed.n_calls == 25
 
 
 def test_mistakes_are_named(tmp_path: Path) -> None:

@@ -101,8 +101,9 @@ def test_without_a_world_model_there_is_nothing_to_film(tmp_path: Path, capsys: 
     ("words", "message"),
     [
         ("--model nothing.zip", "There is no file nothing.zip: give the zip that ESADLEND.save() has written."),
-        ("--model text.zip", "text.zip is no zip file"),
-        ("--model sac.zip", "sac.zip holds no ESADLEND but a model with a policy of stable_baselines3.sac.policies"),
+        ("--model text.zip --trusted", "text.zip is no zip file"),
+        ("--model sac.zip", "sac.zip was not loaded: it has no member 'sb3_esad.json'"),
+        ("--model sac.zip --trusted", "sac.zip holds no ESADLEND but a model with a policy of stable_baselines3.sac.policies"),
         ("--driver keeper --env nowhere-v0", "doesn't exist"),
         ("--driver keeper --env esad-highwy-v0", "Did you mean: `esad-highway`?"),
         ("--driver keeper --env counting-v0", "counting-v0 is no driving scenario"),

@@ -83,7 +83,7 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         },
         seed=seed,
         device="cpu",
-    ).learn(1000)
+    ).learn(1500)
 
 
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])

@@ -66,13 +66,14 @@ class SequenceReplayBuffer(CostBuffer):
 
     def take_settings_of(self, other: CostBuffer) -> None:
         """
-        Return windows as long, and read costs by the same key, as another buffer.
+        Return windows as long and as another buffer does, and read costs by the same key.
 
         :param other: the buffer whose place this one takes
         """
         super().take_settings_of(other)
         assert isinstance(other, SequenceReplayBuffer)
         self.sequence_length = other.sequence_length
+        self.event_fraction, self.recency = other.event_fraction, other.recency
         self._windows = None  # those drawn last were for the former length
 
     def reset(self) -> None:

@@ -12,17 +12,20 @@ from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 import torch as th
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import BaseCallback, EvalCallback, EventCallback
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.type_aliases import GymEnv
+from stable_baselines3.common.vec_env import VecNormalize
 
-from sb3_esad.common.callbacks import all_callbacks
+from sb3_esad.common.callbacks import EVALUATIONS, all_callbacks
 from sb3_esad.common.checks import require
 from sb3_esad.common.save_util import whole_file
 
 CHECKPOINT = "checkpoint.zip"
 """Name of the newest checkpoint in the folder of a run."""
 MODEL, BUFFER, STATISTICS, PROGRESS = "model.zip", "replay_buffer.pkl", "vecnormalize.pkl", "progress.json"
+MEMORY = ("last_time_triggered", "best_mean_reward", "last_mean_reward", *EVALUATIONS)
+"""What SB3's own callbacks remember, by the names of the attributes."""
 PATIENCE = 0.25
 """Share of the interval, its last, in which a checkpoint waits for the end of an episode."""
 
@@ -56,14 +59,15 @@ class RunCheckpointCallback(BaseCallback):
     off. So that hardly an episode is left unfinished, a checkpoint is taken where one has just ended, in the last quarter of
     the interval, and in the midst of one only if none ends there.
 
-    Callbacks go on with their ``n_calls`` and, if they have the methods ``state_dict`` and ``load_state_dict``, with what
-    these hold, in values that JSON has; :class:`CostEvalCallback` has them. If a checkpoint cannot be written, as on a full
+    Callbacks go on with their ``n_calls``, those of SB3 with their evaluations, and those that have the methods ``state_dict``
+    and ``load_state_dict`` with what these hold, in values that JSON has. If a checkpoint cannot be written, as on a full
     disk, there is a warning, the one before it stays, and training goes on.
 
     :param save_freq: steps of all environments together, from one checkpoint to the next at most, up to the next rollout
     :param save_path: folder of the run, where the checkpoint is ``checkpoint.zip``
     :param verbose: 0 silent, 1 tells of each checkpoint
-    :raises ValueError: if ``save_freq`` is no number of steps, or the algorithm none that can be resumed
+    :raises ValueError: if ``save_freq`` is no number of steps, the algorithm none that can be resumed, or the folder that of
+        another run
     """
 
     model: Any
@@ -81,19 +85,26 @@ class RunCheckpointCallback(BaseCallback):
             unfinished.unlink()  # of a process that was killed
 
     def _on_training_start(self) -> None:
+        if self.num_timesteps == 0 and (self.save_path / CHECKPOINT).exists():
+            remedy = "resume that one, choose another folder or delete the file"
+            raise ValueError(f"{self.save_path} holds the {CHECKPOINT} of another run: {remedy}.")
+        for each in _all_with_events(self.locals["callback"]):
+            _describe(each)  # refuses what cannot be saved, now and not after the first interval
         self._saved_at = self.num_timesteps
-        self._episode_ended = self._warned = False
+        self._episode_ended = self._any_ended = self._warned = self._warned_of_cuts = False
 
     def _on_step(self) -> bool:
         self._episode_ended |= bool(np.any(self.locals["dones"]))
+        self._any_ended |= self._episode_ended
         return True
 
     def _on_rollout_start(self) -> None:
         # Here nothing is under way but episodes
         enough = (1 - PATIENCE) * self.save_freq if self._episode_ended else self.save_freq
         if self.model.num_timesteps - self._saved_at >= enough:
+            self._warn_of_cuts()
             self._save()
-            self._saved_at = self.model.num_timesteps
+            self._saved_at, self._any_ended = self.model.num_timesteps, False
         self._episode_ended = False
 
     def _save(self) -> None:
@@ -102,7 +113,7 @@ class RunCheckpointCallback(BaseCallback):
             seed=np.random.randint(2**31 - 1),
             n_envs=self.model.n_envs,
             elapsed=time.time_ns() - self.model.start_time,
-            callbacks=[_describe(each) for each in all_callbacks(self.locals["callback"])],
+            callbacks=[_describe(each) for each in _all_with_events(self.locals["callback"])],
         )
         try:
             write_checkpoint(self.save_path, self.model, progress)
@@ -115,6 +126,12 @@ class RunCheckpointCallback(BaseCallback):
         if self.verbose >= 1:
             print(f"Checkpoint of {self.model.num_timesteps} steps in {self.save_path}")
 
+    def _warn_of_cuts(self) -> None:
+        if not self._any_ended and not self._warned_of_cuts:
+            self._warned_of_cuts = True
+            what = f"Within save_freq={self.save_freq} steps of {self.model.n_envs} environments no episode has ended"
+            warnings.warn(f"{what}, so a checkpoint cuts all of them off: choose a larger save_freq.", stacklevel=2)
+
     def _warn(self, error: OSError) -> None:
         if not self._warned:
             remedy = "training goes on, and the checkpoint before it stays. Make room on the disk"
@@ -122,8 +139,23 @@ class RunCheckpointCallback(BaseCallback):
         self._warned = True
 
 
+def _all_with_events(callback: BaseCallback) -> list[BaseCallback]:
+    """A callback, those in it if it is a list, and those that they call."""
+    found = []
+    for each in all_callbacks(callback):
+        children = (each.callback, getattr(each, "callback_on_new_best", None)) if isinstance(each, EventCallback) else ()
+        found += [each, *(other for child in children if child is not None for other in _all_with_events(child))]
+    return found
+
+
 def _describe(callback: BaseCallback) -> tuple[str, int, dict[str, Any]]:
-    return type(callback).__name__, callback.n_calls, callback.state_dict() if hasattr(callback, "state_dict") else {}
+    name, plain = type(callback).__name__, vars(callback)
+    remembers: Any = getattr(callback, "state_dict", lambda: {key: plain[key] for key in MEMORY if key in plain})
+    state = remembers()
+    try:
+        return name, callback.n_calls, json.loads(json.dumps(state, default=np.generic.item))
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"What {name} remembers cannot be saved ({error}): give its state_dict plain values.") from error
 
 
 def _seed_evaluations(callback: BaseCallback, progress: Progress) -> None:
@@ -140,7 +172,7 @@ def resume_callbacks(callback: BaseCallback, progress: Progress) -> None:
     :param progress: of the run that was cut off
     """
     former = list(progress.callbacks)
-    for each in all_callbacks(callback):
+    for each in _all_with_events(callback):
         found = next((state for state in former if state[0] == type(each).__name__), None)
         if found is None:
             continue
@@ -148,6 +180,8 @@ def resume_callbacks(callback: BaseCallback, progress: Progress) -> None:
         each.n_calls = found[1]
         if hasattr(each, "load_state_dict"):
             each.load_state_dict(found[2])
+        else:
+            vars(each).update(found[2])
     _seed_evaluations(callback, progress)
 
 
@@ -169,8 +203,8 @@ def write_checkpoint(folder: Path, model: OffPolicyAlgorithm, progress: Progress
             with io.BufferedWriter(archive.open(BUFFER, "w", force_zip64=True)) as buffered:
                 model.save_replay_buffer(buffered)
             if normalize is not None:
-                archive.writestr(STATISTICS, pickle.dumps((normalize.obs_rms, normalize.ret_rms)))
-            archive.writestr(PROGRESS, json.dumps(progress._asdict(), default=np.generic.item))
+                archive.writestr(STATISTICS, pickle.dumps(_statistics(normalize)))
+            archive.writestr(PROGRESS, json.dumps(progress._asdict()))
         file.flush()
         os.fsync(file.fileno())  # lest a power failure leaves the new name without the new content
 
@@ -211,4 +245,9 @@ def _read_statistics(archive: zipfile.ZipFile, model: OffPolicyAlgorithm) -> Non
         remedy = "wrap the environment in VecNormalize as in the run" if saved else "the run had none around its environment"
         raise ValueError(f"{archive.filename} and the environment differ in VecNormalize: {remedy}.")
     if normalize is not None:
-        normalize.obs_rms, normalize.ret_rms = pickle.loads(archive.read(STATISTICS))
+        vars(normalize).update(pickle.loads(archive.read(STATISTICS)))
+
+
+def _statistics(normalize: VecNormalize) -> dict[str, Any]:
+    """Those that there are: SB3 has none of observations that it does not normalise."""
+    return {name: vars(normalize)[name] for name in ("obs_rms", "ret_rms") if name in vars(normalize)}

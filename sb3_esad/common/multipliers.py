@@ -183,11 +183,11 @@ class AugmentedLagrangian(Penalty):
 
     def _watch_bound(self, gradient_steps: int) -> None:
         self.updates_at_bound.add_(gradient_steps).mul_(self.multiplier >= self.upper_bound)
-        if self.updates_at_bound < PATIENCE:
+        if self.updates_at_bound < PATIENCE or self.episodes.seen < ENOUGH_ROAD or self.lambda_lr == 0:
             return
         cost, length = self.episodes.expected_cost, self.episodes.episode_length
         what = f"The multiplier has been at its upper bound {self.upper_bound} for {PATIENCE} updates"
-        if self.episodes.seen >= ENOUGH_ROAD and cost > self.cost_limit:
+        if cost > self.cost_limit:
             remedy = "looks infeasible: allow more, or make sure that some behaviour could keep it"
             worse = f"and an episode of {length:.0f} steps still costs {cost:.3g}"
             self._warn("limit", f"{what}, {worse}: cost_limit={self.cost_limit} {remedy}.")

@@ -81,7 +81,12 @@ class WorldModel(LearningModule):
         :param observations: one observation of any type, or one for each key of a Dict space
         :return: the images by key, the key of a single observation is "observation"
         """
-        return {key: _by_key(observations)[key] for key, head in self._observation_heads() if isinstance(head, ImageHead)}
+        return {key: _by_key(observations)[key] for key in self.image_keys}
+
+    @property
+    def image_keys(self) -> list[str]:
+        """Keys of the observations that are shown as an image."""
+        return [key for key, head in self._observation_heads() if isinstance(head, ImageHead)]
 
     def initial(self, n: int) -> LatentState:
         """
