@@ -45,6 +45,7 @@ def seed_of(folder: Path) -> str:
     return lines[lines.index("- --seed") + 1].removeprefix("- ").strip("'")
 
 
+@pytest.mark.filterwarnings("ignore:Within save_freq")
 def test_nothing_but_the_folder_is_asked_for(
     killed: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
