@@ -71,9 +71,10 @@ class WatchCallback(BaseCallback):
             self._risks = []
 
     def _show_films(self, model: LatentAlgorithm) -> None:
-        world_model, episode = model.policy.average.world_model, None
-        if world_model.image_keys:
-            episode = model.replay_buffer.latest_episode(self.length, env=model._vec_normalize_env)
+        world_model = model.policy.average.world_model
+        if not world_model.image_keys:
+            return
+        episode = model.replay_buffer.latest_episode(self.length, env=model._vec_normalize_env)
         if episode is None:
             return
         before, after, actions = episode

@@ -180,13 +180,6 @@ def test_a_gaussian_would_make_sure_of_a_crash() -> None:
     assert (slope > 0).tolist() == [True, True, False, False]
 
 
-def test_discounted_sum_is_the_first_lambda_return_for_lambda_1() -> None:
-    amounts, continues, values = th.rand(3, 4, 5).unbind()
-    returns = F.lambda_return(amounts.T, continues.T, values.T, 0.9, 1.0)
-    th.testing.assert_close(F.discounted_sum(amounts, continues, values[-1], 0.9), returns[:, 0])
-    assert F.discounted_sum(th.ones(3, 1), th.ones(3, 1), t(8.0), 0.5).item() == pytest.approx(2.75)
-
-
 def test_variance_of_several_steps_is_a_lambda_return() -> None:
     cost, continues, q, q_next, v_next = th.rand(5, 3, 4, dtype=th.float64)
     joint = F.indicator_joint(cost, continues, 0.0)

@@ -340,28 +340,26 @@ def test_another_number_of_environments() -> None:
     assert penalty.episodes.costs[:2].tolist() == [1.0, 1.0]
 
 
+def update_silently(penalty: AugmentedLagrangian, times: int) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for _ in range(times):
+            penalty.update(1.0)
+
+
 def test_warns_once_at_the_upper_bound() -> None:
     penalty = make_penalty(lagrangian_multiplier_init=50.0, episode_length=1)
     calibrate(penalty, 5.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for _ in range(499):
-            penalty.update(1.0)
+    update_silently(penalty, 499)
     with pytest.warns(UserWarning, match="bound 50.0 for 500 .* still costs 5: cost_limit=1.0 looks infeasible"):
         penalty.update(1.0)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for _ in range(600):
-            penalty.update(1.0)
+    update_silently(penalty, 600)
 
 
 def test_a_multiplier_at_its_bound_is_no_infeasible_limit_where_the_road_is_content() -> None:
     penalty = make_penalty(lagrangian_multiplier_init=50.0, episode_length=1)
     calibrate(penalty, 0.5)
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        for _ in range(499):
-            penalty.update(1.0)
+    update_silently(penalty, 499)
     with pytest.warns(UserWarning, match=r"bound 50.0 for 500 updates though an episode of 1 steps costs 0.5 of 1.0 allowed;"):
         penalty.update(1.0)
     observe_episodes(penalty, cost=5.0)

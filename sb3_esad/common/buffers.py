@@ -66,7 +66,7 @@ class SequenceReplayBuffer(CostBuffer):
 
     def take_settings_of(self, other: CostBuffer) -> None:
         """
-        Return windows as long and as another buffer does, and read costs by the same key.
+        Draw windows as another buffer does, and read costs by the same key.
 
         :param other: the buffer whose place this one takes
         """
@@ -125,7 +125,7 @@ class SequenceReplayBuffer(CostBuffer):
         :return: observations, those that followed, of shape (L, ...), and the actions between them, in [-1, 1], of shape
             (L, A); None if no whole episode is stored
         """
-        order = np.arange(self.size()) if not self.full else (np.arange(self.size()) + self.pos) % self.buffer_size
+        order = np.roll(np.arange(self.size()), -self.pos)  # oldest first; a young buffer is rolled once around
         openings = [np.flatnonzero(starts) for starts in self.episode_starts[order].T]
         whole = [(each[-2], each[-1], env_index) for env_index, each in enumerate(openings) if len(each) > 1]
         if not whole:

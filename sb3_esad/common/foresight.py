@@ -5,7 +5,7 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_esad.common.agent import LatentAgent
-from sb3_esad.common.functional import barrier_residual, discounted_sum
+from sb3_esad.common.functional import barrier_residual, lambda_return
 from sb3_esad.common.type_aliases import LatentState
 
 
@@ -56,8 +56,8 @@ class Foresight:
         rewards, costs, continues = imagined.predictions
         end = imagined.grids[-1], imagined.actions[-1]
         end_costs, end_variance = agent.cost_critic(*end)
-        values = discounted_sum(rewards, continues, agent.critic(*end).min(0).values, self.gamma)
-        means = discounted_sum(costs, continues, end_costs.max(0).values, self.cost_gamma)
+        values = _sum_up(rewards, continues, agent.critic(*end).min(0).values, self.gamma)
+        means = _sum_up(costs, continues, end_costs.max(0).values, self.cost_gamma)
         _, variance = agent.cost_critic(imagined.grids[0], imagined.actions[0])
         risks = agent.cost_critic.risk(means[None], variance, self.risk_level)
         return Outlook(values, risks, agent.cost_critic.risk(end_costs, end_variance, self.risk_level))
@@ -83,3 +83,9 @@ class Foresight:
         :return: residual, <= 0 where the condition holds, of the shape of its fields
         """
         return barrier_residual(outlook.next_risks, outlook.risks, budget, self.barrier_decay)
+
+
+def _sum_up(amounts: th.Tensor, continues: th.Tensor, end: th.Tensor, gamma: float) -> th.Tensor:
+    """What H steps bring, fields of shape (H, N), and what is expected after the last one, of shape (N,)."""
+    expected = end[:, None].expand(-1, len(amounts))  # of which only the last column counts where lambda is 1
+    return lambda_return(amounts.T, continues.T, expected, gamma, lambda_=1.0)[:, 0]

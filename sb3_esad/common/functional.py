@@ -220,21 +220,6 @@ def sampled_variance_target(
     return (cost + gamma * continues * next_mean - mean) ** 2 + gamma**2 * continues * next_variance
 
 
-def discounted_sum(amounts: th.Tensor, continues: th.Tensor, end: th.Tensor, gamma: float) -> th.Tensor:
-    """
-    Add up what H steps bring and what is expected after them: the lambda-return of the first step for lambda = 1.
-
-    :param amounts: rewards or costs of the steps, of shape (H, N)
-    :param continues: probabilities that the episode goes on after each, of shape (H, N)
-    :param end: what is expected after the last step, of shape (N,)
-    :param gamma: discount
-    :return: shape (N,)
-    """
-    for amount, going_on in zip(amounts.flip(0), continues.flip(0), strict=True):
-        end = amount + gamma * going_on * end
-    return end
-
-
 def barrier_residual(risk_next: th.Tensor, risk_now: th.Tensor, budget: float | th.Tensor, barrier_decay: float) -> th.Tensor:
     """
     By how much the barrier condition h' <= (1 - alpha_b) h on h = Gamma - d is violated.

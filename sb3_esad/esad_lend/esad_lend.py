@@ -165,9 +165,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         }
 
     def _imagined_risk(self, imagined: Imagination) -> th.Tensor:
-        """
-        Safety measure of each imagined step, of shape (H, N); :meth:`risk`, which moves the multiplier, is the critics' own.
-        """
+        """Safety measure of each imagined step, of shape (H, N); :meth:`risk`, which moves the multiplier, is the critics'."""
         costs = imagined_costs(self.policy.cost_critic, imagined, self.discount_of_cost, self.lambda_return)
         _, variance = self.policy.cost_critic(*taken(imagined))
         return rising_cvar(costs, variance.view_as(costs), self.risk_level)
