@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from configparser import ConfigParser
 from functools import partial
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from typing import Any
 from unittest import mock
@@ -19,8 +20,8 @@ from stable_baselines3.common.logger import Logger
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from test_architecture import RANKS
 
-from sb3_esad import ESADLEND, driving_evaluation
-from sb3_esad.__main__ import make_parser
+from sb3_esad import ESADLEND, __main__, driving_evaluation
+from sb3_esad.__main__ import main, make_parser
 from sb3_esad.common.checkpoints import RunCheckpointCallback
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.hyperparams import constructor_arguments
@@ -31,13 +32,11 @@ TEXTS = {str(page.relative_to(ROOT)): page.read_text() for page in [ROOT / "READ
 
 EXAMPLE = re.compile(r"```python\n(?P<code>.*?)```(?:\n\n```text\n(?P<output>.*?)```)?", re.DOTALL)
 WITH_EXAMPLES = [page for page, text in TEXTS.items() if "```python" in text]
+BASH = re.compile(r"```bash\n(.*?)```", re.DOTALL)
+WITH_COMMANDS = [page for page, text in TEXTS.items() if "/python -m" in "".join(BASH.findall(text))]
 SPANS = r"`((?:\.venv/bin/python|make|pip install) [^`]*)`"
 COMMANDS = sorted(
-    {
-        line
-        for text in TEXTS.values()
-        for line in [*re.findall(SPANS, text), *"".join(re.findall(r"```bash\n(.*?)```", text, re.DOTALL)).splitlines()]
-    }
+    {line for text in TEXTS.values() for line in [*re.findall(SPANS, text), *"".join(BASH.findall(text)).splitlines()]}
 )
 LINKS = [(page, link) for page, text in TEXTS.items() for link in re.findall(r"\]\((?!https?:)(.*?)\)", text)]
 
@@ -54,13 +53,13 @@ def brief(monkeypatch: pytest.MonkeyPatch) -> None:
         self._convert_train_freq()
         return learn(self, 25 * self.n_envs, *args, **kwargs)
 
-    def briefly(evaluate: Callable[..., Any], who: Any, env_id: str, seeds: range) -> Any:
-        return evaluate(who, env_id, seeds[:2])
+    def briefly(evaluate: Callable[..., Any], who: Any, env_id: str, seeds: range, *how: Any) -> Any:
+        return evaluate(who, env_id, seeds[:2], *how)
 
     monkeypatch.setattr(OffPolicyAlgorithm, "learn", learn_briefly)
     monkeypatch.setattr(RunCheckpointCallback, "save_freq", property(lambda _: 10, lambda *_: None), raising=False)
-    for name in ("evaluate_model", "evaluate_driver"):
-        monkeypatch.setattr(driving_evaluation, name, partial(briefly, getattr(driving_evaluation, name)))
+    for name, module in product(("evaluate_model", "evaluate_driver"), (driving_evaluation, __main__)):
+        monkeypatch.setattr(module, name, partial(briefly, getattr(module, name)))
 
 
 @pytest.mark.filterwarnings("ignore:rich is experimental")
@@ -75,6 +74,20 @@ def test_examples_run(
         capsys.readouterr()
         exec(compile(example["code"], f"example of {page}", "exec"), {"__name__": "__main__"})
         assert example["output"] in (None, capsys.readouterr().out)
+
+
+@pytest.mark.filterwarnings("ignore:Within save_freq")
+@pytest.mark.parametrize("page", WITH_COMMANDS)
+def test_commands_run(page: str, brief: None, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the order in which the page has them, after `make demo`; what installs, or needs clones of others, is left out."""
+    monkeypatch.chdir(tmp_path)
+    ESADLEND("CnnPolicy", "esad-highway-v0", **TINY).save("demo/esad_lend.zip")
+    for line in "".join(BASH.findall(TEXTS[page])).splitlines():
+        program, *words = shlex.split(line)
+        if words[:2] == ["-m", "sb3_esad"]:
+            assert main(words[2:]) == 0
+        elif program.endswith("python") and words[0] == "-m":
+            run_python(words)
 
 
 def test_there_are_no_other_blocks() -> None:
