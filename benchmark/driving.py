@@ -21,6 +21,7 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 
 from sb3_esad import ADEND, ESADLEND, SADLEN, WCSAC, SACLag
+from sb3_esad.demo import FEW_UPDATES
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.hyperparams import load_hyperparams
@@ -152,13 +153,15 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--set", type=json.loads, default={}, help="JSON of constructor arguments to replace")
+    parser.add_argument("--few-updates", action="store_true", help="as the demo has them, for algorithms that imagine")
     args = parser.parse_args()
     th.set_num_threads(args.threads)
     args.out.mkdir(parents=True, exist_ok=True)
     path = args.out / f"{args.algorithm}_{args.seed}.jsonl"
     path.unlink(missing_ok=True)
     curve = LearningCurve(path, args.env, args.every, range(args.unseen, args.unseen + args.episodes))
-    ALGORITHMS[args.algorithm](args.env, args.seed, args.set).learn(args.steps, callback=curve)
+    changes = {**(FEW_UPDATES if args.few_updates else {}), **args.set}
+    ALGORITHMS[args.algorithm](args.env, args.seed, changes).learn(args.steps, callback=curve)
 
 
 if __name__ == "__main__":

@@ -2,7 +2,8 @@
 The experiments of docs/experiments.md by name: ``python benchmark/experiments.py E5 --seeds 0 1 2``.
 
 Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept.
-The table pools the last evaluation of all seeds: driving score with the interval over seeds, the rest over episodes.
+Those that imagine have the demo's budget: 20,000 steps, about a thousand updates. The table pools the last evaluation of all
+seeds: driving score with the interval over seeds, the rest over episodes.
 """
 
 import argparse
@@ -10,7 +11,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -19,6 +20,7 @@ import numpy as np
 
 from sb3_esad.envs.intervals import mean_interval, wilson_interval
 
+IMAGINING = ("esad_lend", "sad_len", "ad_end")
 HIGHWAY, BRAKING = "esad-highway-v0", "esad-braking-v0"
 SITUATIONS = (HIGHWAY, "esad-traffic-negotiation-v0", "esad-obstacle-avoidance-v0", BRAKING)
 
@@ -41,13 +43,11 @@ class Experiment(NamedTuple):
 
     :param question: in words
     :param envs: scenarios
-    :param steps: of each training
     :param arms: by name, the first is what the others are compared with
     """
 
     question: str
     envs: tuple[str, ...]
-    steps: int
     arms: dict[str, Arm]
 
 
@@ -61,36 +61,32 @@ def diffusion(steps: int) -> dict[str, Any]:
     return {"policy_kwargs": {"head_kwargs": {"diffusion_steps": steps}}}
 
 
-FILTER = {"filter_start": 500}
-FULL = {**diffusion(2), **FILTER, "barrier_coef": 1.0}
+FILTER: dict[str, Any] = {"filter_start": 300}
+BARRIER: dict[str, Any] = {"barrier_coef": 1.0}
 EXPERIMENTS = {
     "E4": Experiment(
         "How many steps of diffusion?",
         (HIGHWAY, "esad-traffic-negotiation-v0"),
-        15_000,
         {f"K = {steps}": Arm("esad_lend", diffusion(steps)) for steps in (0, 1, 2, 3)},
     ),
     "E5": Experiment(
         "Does the filter prevent collisions, and the barrier?",
         (HIGHWAY, BRAKING),
-        15_000,
         {
             "neither": Arm("esad_lend", {}),
             "filter": Arm("esad_lend", FILTER),
-            "barrier": Arm("esad_lend", {"barrier_coef": 1.0}),
-            "both": Arm("esad_lend", {**FILTER, "barrier_coef": 1.0}),
+            "barrier": Arm("esad_lend", BARRIER),
+            "both": Arm("esad_lend", {**FILTER, **BARRIER}),
         },
     ),
     "E6": Experiment(
         "How much entropy?",
         (HIGHWAY,),
-        15_000,
         {f"target {target}": Arm("esad_lend", {"target_entropy": target}) for target in (-2.0, -1.0, 0.0)},
     ),
     "E7": Experiment(
         "Are recorded costs needed, and more of them than there were?",
         (HIGHWAY,),
-        15_000,
         {
             "both": Arm("esad_lend", {}),
             "critics from imagination alone": Arm("esad_lend", {"replay_cost_critic_coef": 0.0}),
@@ -100,16 +96,14 @@ EXPERIMENTS = {
     "E9": Experiment(
         "Ahead of algorithms without a model?",
         (HIGHWAY, BRAKING),
-        20_000,
         {name: Arm(name, {}) for name in ("esad_lend", "sac", "sac_lag", "wcsac")},
     ),
     "ablations": Experiment(
         "What are diffusion and safety worth?",
         SITUATIONS,
-        15_000,
         {
-            "ESAD-LEND": Arm("esad_lend", FULL),
-            "SAD-LEN": Arm("sad_len", {**FILTER, "barrier_coef": 1.0}),
+            "ESAD-LEND": Arm("esad_lend", {**diffusion(2), **FILTER, **BARRIER}),
+            "SAD-LEN": Arm("sad_len", {**FILTER, **BARRIER}),
             "AD-END": Arm("ad_end", {}),
         },
     ),
@@ -139,17 +133,18 @@ class Run(NamedTuple):
         return self.folder / f"{self.arm.algorithm}_{self.seed}.jsonl"
 
 
-def runs(name: str, seeds: list[int], out: Path) -> Iterator[Run]:
+def runs(name: str, envs: Sequence[str], seeds: list[int], out: Path) -> Iterator[Run]:
     """
     List the trainings of an experiment.
 
     :param name: key of ``EXPERIMENTS``
+    :param envs: scenarios, of those that it has
     :param seeds: of the trainings
     :param out: folder of all results
     :return: one run for each scenario, arm and seed
     """
     for seed in seeds:
-        for env_id in EXPERIMENTS[name].envs:
+        for env_id in envs:
             for arm_name, arm in EXPERIMENTS[name].arms.items():
                 yield Run(env_id, arm_name, arm, seed, out / name / env_id / arm_name.replace(" ", "_"))
 
@@ -166,10 +161,11 @@ def train(run: Run, steps: int, episodes: int) -> None:
         return
     script = Path(__file__).with_name("driving.py")
     what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
-    how = ["--steps", str(steps), "--every", "3000", "--episodes", str(episodes), "--threads", "1", "--out", str(run.folder)]
+    how = ["--steps", str(steps), "--every", str(steps // 2), "--episodes", str(episodes), "--threads", "1"]
+    how += ["--few-updates"] * (run.arm.algorithm in IMAGINING)
     print(f"{run.env_id}, {run.name}, seed {run.seed} ...", flush=True)
     quiet = {"stdout": subprocess.DEVNULL, "env": {**os.environ, "OMP_NUM_THREADS": "1"}}
-    subprocess.run([sys.executable, str(script), *what, *how], check=True, **quiet)  # type: ignore[call-overload]
+    subprocess.run([sys.executable, str(script), *what, *how, "--out", str(run.folder)], check=True, **quiet)  # type: ignore[call-overload]
 
 
 def row(name: str, ends: list[dict[str, Any]]) -> str:
@@ -191,22 +187,21 @@ def row(name: str, ends: list[dict[str, Any]]) -> str:
         cells.append(
             f"{scores.mean():.1f} [{low:.1f}, {high:.1f}], {100 * free / n:.0f} [{safe[0]:.0f}, {safe[1]:.0f}], {speed:.1f}"
         )
+    nearness = np.mean([end["best"]["TTC_5"] for end in ends])
     costs = ", ".join(f"{end['training_cost']:.0f}" for end in ends)
-    return f"| {name} | {' | '.join(cells)} | {costs} |"
+    return f"| {name} | {' | '.join(cells)} | {nearness:.2f} | {costs} |"
 
 
-def print_table(name: str, seeds: list[int], out: Path) -> None:
+def print_table(every: list[Run]) -> None:
     """
     Print what has been found so far.
 
-    :param name: key of ``EXPERIMENTS``
-    :param seeds: of the trainings
-    :param out: folder of all results
+    :param every: trainings of an experiment
     """
-    print(f"{name}: {EXPERIMENTS[name].question}\n")
-    print("| scenario, arm | best: DS, collision-free %, m/s | sampled | training costs |\n|---|---|---|---|")
+    print("| scenario, arm | best: DS, collision-free %, m/s | sampled | best: TTC_5 [s] | training costs |")
+    print("|---|---|---|---|---|")
     ends: dict[str, list[dict[str, Any]]] = {}
-    for run in runs(name, seeds, out):
+    for run in every:
         if run.curve.exists():
             ends.setdefault(f"{run.env_id}, {run.name}", []).append(json.loads(run.curve.read_text().splitlines()[-1]))
     for label, lines in ends.items():
@@ -218,16 +213,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("name", choices=list(EXPERIMENTS))
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
-    parser.add_argument("--steps", type=int, help="instead of the experiment's own")
+    parser.add_argument("--envs", nargs="+", help="scenarios, instead of all that the experiment has")
+    parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--table", action="store_true", help="print what has been found so far")
     args = parser.parse_args()
+    experiment = EXPERIMENTS[args.name]
+    every = list(runs(args.name, args.envs or experiment.envs, args.seeds, args.out))
     if not args.table:
-        steps = args.steps or EXPERIMENTS[args.name].steps
         with ThreadPoolExecutor(2) as two:
-            list(two.map(lambda run: train(run, steps, args.episodes), runs(args.name, args.seeds, args.out)))
-    print_table(args.name, args.seeds, args.out)
+            list(two.map(lambda run: train(run, args.steps, args.episodes), every))
+    print(f"{args.name}: {experiment.question}\n")
+    print_table(every)
 
 
 if __name__ == "__main__":
