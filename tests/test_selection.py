@@ -75,12 +75,14 @@ def test_the_choice_is_that_of_brute_force(agent: LatentAgent) -> None:
     safety = make_filter(calm=0.2)
     seen = belief(agent, n)
     th.manual_seed(3)
-    proposals = safety._proposals(agent, seen.state, th.full((n, 1), -0.9))
-    assert proposals.shape == (5, n, 1)
+    others = safety._proposals(agent, seen.state)
+    assert others.shape == (4, n, 1)
     th.manual_seed(3)
-    actions, helpless = safety._choose(agent, seen.state.map(lambda field: field[None]), seen.state, th.full((n, 1), -0.9))
+    scenarios, proposed = seen.state.map(lambda field: field[None]), th.full((n, 1), -0.9)
+    own = safety.assess(agent, scenarios, proposed[None])
+    actions, helpless = safety._choose(agent, scenarios, seen.state, proposed, own)
     for state in range(n):
-        candidates = proposals[:, state, 0].tolist()
+        candidates = [-0.9, *others[:, state, 0].tolist()]
         admissible = [a for a in candidates if (a - 0.2) ** 2 <= BUDGET_SCALE]
         expected = max(admissible) if admissible else min(candidates, key=lambda a: (a - 0.2) ** 2)
         assert actions[state].item() == pytest.approx(expected)

@@ -151,12 +151,14 @@ class SafetyFilter(ActionFilter):
             return NoFilter().select(agent, belief, proposed)
         with autocast(proposed.device):
             scenarios = draw_scenarios(agent, belief, self.n_candidates)
-            doubtful = ~self._admissible(self.assess(agent, scenarios, proposed[None]))[0]
+            own = self.assess(agent, scenarios, proposed[None])
+            doubtful = ~self._admissible(own)[0]
             actions, helpless = proposed.clone(), th.zeros_like(doubtful)
             if doubtful.any():
                 chosen = scenarios.map(lambda field: field[:, doubtful])
                 state = belief.state.map(lambda field: field[doubtful])
-                actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful])
+                known = Outlook(*(field[:, doubtful] for field in own))
+                actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful], known)
         return Selection(actions, (actions != proposed).any(1), helpless)
 
     def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> Outlook:
@@ -182,22 +184,23 @@ class SafetyFilter(ActionFilter):
         return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget))
 
     def _choose(
-        self, agent: LatentAgent, scenarios: LatentState, state: LatentState, proposed: th.Tensor
+        self, agent: LatentAgent, scenarios: LatentState, state: LatentState, proposed: th.Tensor, own: Outlook
     ) -> tuple[th.Tensor, th.Tensor]:
-        proposals = self._proposals(agent, state, proposed)
-        outlook = self.assess(agent, scenarios, proposals)
+        others = self._proposals(agent, state)
+        proposals = th.cat([proposed[None], others])
+        outlook = Outlook(*(th.cat(fields) for fields in zip(own, self.assess(agent, scenarios, others), strict=True)))
         admissible = self._admissible(outlook)
         helpless = ~admissible.any(0)
         promising = outlook.values.masked_fill(~admissible, -math.inf).argmax(0)
         best = th.where(helpless, outlook.risks.argmin(0), promising)
         return proposals[best, th.arange(len(proposed), device=best.device)], helpless
 
-    def _proposals(self, agent: LatentAgent, state: LatentState, proposed: th.Tensor) -> th.Tensor:
-        """The proposed action, and of samples of the actor and of uniform actions those that the critics fear least."""
-        grids, size = agent.world_model.features(state), proposed.shape[1]
+    def _proposals(self, agent: LatentAgent, state: LatentState) -> th.Tensor:
+        """Of samples of the actor and of uniform actions those that the critics fear least, of shape (P, N, A)."""
+        grids = agent.world_model.features(state)
         samples = agent.actor(grids.repeat(self.n_proposals, 1, 1, 1)).unflatten(0, (self.n_proposals, -1))
-        actions = th.stack([samples, 2 * th.rand(self.n_proposals, len(proposed), size, device=proposed.device) - 1])
+        actions = th.stack([samples, 2 * th.rand_like(samples) - 1])
         risks = self.foresight.risk(agent, grids.repeat(2 * self.n_proposals, 1, 1, 1), actions.flatten(0, 2))
         calmest = risks.view(actions.shape[:3]).topk(CALMEST, dim=1, largest=False).indices
-        chosen = actions.gather(1, calmest[..., None].expand(-1, -1, -1, size))
-        return th.cat([proposed[None], chosen.flatten(0, 1)])
+        chosen = actions.gather(1, calmest[..., None].expand(-1, -1, -1, samples.shape[-1]))
+        return chosen.flatten(0, 1)
