@@ -75,7 +75,7 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
     who.add_argument("--model", type=Path, metavar="FILE.zip", help="saved model of any algorithm")
     who.add_argument("--driver", choices=DRIVERS, help="scripted driver")
     _add_trusted(parser)
-    parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
+    _add_env(parser)
     parser.add_argument("--episodes", type=_positive, default=100, metavar="N", help="how many (default: %(default)s)")
     parser.add_argument(
         "--seed", type=_not_negative, default=0, metavar="S", help="episode i uses seed S + i (default: %(default)s)"
@@ -114,9 +114,14 @@ def _add_explain(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_explain)
     parser.add_argument("--model", type=Path, required=True, metavar="FILE.zip", help="saved model that imagines")
     _add_trusted(parser)
-    parser.add_argument("--env", default=ENV_ID, metavar="ID", help="environment (default: %(default)s)")
+    _add_env(parser)
     parser.add_argument("--seed", type=_not_negative, default=0, metavar="S", help="of the episode (default: %(default)s)")
     parser.add_argument("--out", type=Path, default=Path("explanation.mp4"), metavar="FILE.mp4", help="(default: %(default)s)")
+
+
+def _add_env(parser: argparse.ArgumentParser) -> None:
+    text = "environment, as MODULE:ID if a module of yours registers it (default: %(default)s)"
+    parser.add_argument("--env", default=ENV_ID, metavar="ID", help=text)
 
 
 def _add_trusted(parser: argparse.ArgumentParser) -> None:

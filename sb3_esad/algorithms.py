@@ -25,7 +25,10 @@ def load_model(path: Path, trusted: bool = False) -> Any:
     :param path: its zip
     :param trusted: let it run what code it holds
     :return: the model
-    :raises ValueError: if the file is missing, damaged, or holds something else
+    :raises ValueError: if the file is missing, damaged, or holds something else, or if its observations were normalised
     """
+    if any(path.parent.glob("*/vecnormalize.pkl")):
+        reason = f"{path} was trained on observations that RL Zoo normalised, by statistics that lie beside it"
+        raise ValueError(f"{reason}: evaluate it by python -m sb3_esad enjoy, which reads them.")
     by_class = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}
     return by_class.get(described_class(path), ESADLEND).load(path, trusted=trusted)

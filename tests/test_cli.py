@@ -89,6 +89,16 @@ def test_evaluate_a_model_of_any_algorithm(name: str, tmp_path: Path, capsys: py
     assert "| return ↑           | 28.0 [28.0, 28.0]" in capsys.readouterr().out
 
 
+def test_a_model_that_saw_normalised_observations_is_not_judged_without(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "counting-v0").mkdir()
+    (tmp_path / "counting-v0" / "vecnormalize.pkl").touch()
+    assert main(["evaluate", "--model", str(tmp_path / "model.zip"), "--env", "counting-v0"]) == 2
+    said = capsys.readouterr().err
+    assert "normalised" in said and "python -m sb3_esad enjoy" in said
+
+
 def test_without_a_world_model_there_is_nothing_to_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "model.zip"
     WCSAC("CnnPolicy", SHORT, policy_kwargs={"net_arch": [8]}, buffer_size=100).save(path)

@@ -73,6 +73,7 @@ def test_missing_costs_are_zero_with_one_warning() -> None:
         ("cost_limit", -1.0, ">= 0, or None for no limit"),
         ("cost_limit", float("nan"), ">= 0, or None for no limit"),
         ("cost_limit", float("inf"), ">= 0, or None for no limit"),
+        ("cost_limit", "0.05", ">= 0, or None for no limit"),
         ("risk_level", 0.0, "(0, 1]"),
         ("risk_level", 1.5, "(0, 1]"),
         ("risk_level", -0.5, "(0, 1]"),
@@ -205,7 +206,7 @@ def test_what_is_no_dictionary() -> None:
     check_sentence(error, "MultiInputPolicy needs a Dict", str(VECTOR), "MlpPolicy")
     with pytest.raises(ValueError, match="You must use `MultiInputPolicy`"):
         make_model("MlpPolicy", RandomEnv(SPACES["MultiInputPolicy"]))
-    with pytest.raises(ValueError, match="Policy LstmPolicy unknown"):
+    with pytest.raises(ValueError, match="policy is 'LstmPolicy'; choose one of MlpPolicy, CnnPolicy, MultiInputPolicy"):
         make_model("LstmPolicy")
 
 

@@ -100,6 +100,12 @@ def test_plots(logs: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caps
     assert f"it is in Results_{ENV}.png" in capsys.readouterr().out
 
 
+def test_what_was_never_evaluated_is_not_plotted_as_costs_of_zero(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["all_plots", "-a", "esad_lend", "wcsac", "-e", ENV, "-f", str(logs), "-k", "costs"]) == 2
+    said = capsys.readouterr().err
+    assert "holds 0 evaluations of wcsac" in said and "leave it out" in said
+
+
 def test_going_on(logs: Path, run_folder: Path, tmp_path: Path) -> None:
     words = ["-n", "40", "--eval-freq", "-1", "-i", str(run_folder / f"{ENV}.zip")]
     assert train(tmp_path, *words, gamma=0.5) == 0

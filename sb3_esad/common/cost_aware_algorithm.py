@@ -7,6 +7,7 @@ import numpy as np
 import torch as th
 from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.callbacks import BaseCallback
+from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, MaybeCallback, RolloutReturn
 from stable_baselines3.common.utils import safe_mean
 
@@ -62,6 +63,11 @@ class CostAwareAlgorithm(WholeFiles):
         super()._setup_model()
         self._episode_costs = EpisodeCosts()
         self._images = ImageWatch(self.observation_space, self.policy.normalize_images)
+
+    def _get_policy_from_name(self, policy_name: str) -> type[BasePolicy]:
+        known = ", ".join(self.policy_aliases)
+        require(policy_name in self.policy_aliases, "policy", policy_name, f"one of {known}")
+        return super()._get_policy_from_name(policy_name)
 
     def learn(
         self: SelfCostAware,

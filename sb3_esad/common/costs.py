@@ -49,8 +49,9 @@ class CostReader:
         if self._warned:
             return
         self._warned = True
-        hint = ' There is a "crashed": pass cost_key="crashed" to use it.' if "crashed" in info else ""
-        warnings.warn(f'No cost: the info dict has no "{self.cost_key}", so the cost counts as 0.{hint}', stacklevel=2)
+        known = 'there is a "crashed": pass cost_key="crashed" to use it'
+        remedy = known if "crashed" in info else "pass the cost_key that has it, or cost_limit=None and ignore this"
+        warnings.warn(f'No cost: the info dict has no "{self.cost_key}", so the cost counts as 0; {remedy}.', stacklevel=2)
 
 
 class FinishedEpisode(NamedTuple):

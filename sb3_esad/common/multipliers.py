@@ -1,6 +1,7 @@
 """What a violated cost limit costs the policy, by an augmented Lagrangian."""
 
 import math
+from numbers import Real
 
 import numpy as np
 import torch as th
@@ -70,7 +71,7 @@ class AugmentedLagrangian(Penalty):
     ) -> None:
         super().__init__()
         tail_factor(risk_level)  # refuses a level outside (0, 1]
-        finite = 0 <= cost_limit < math.inf
+        finite = isinstance(cost_limit, Real) and 0 <= cost_limit < math.inf
         require(finite, "cost_limit", cost_limit, "the cost allowed per episode, a number >= 0, or None for no limit")
         require(0 <= cost_gamma <= 1, "cost_gamma", cost_gamma, "a discount in [0, 1]")
         require(episode_length >= 1, "episode_length", episode_length, "a number of steps >= 1")

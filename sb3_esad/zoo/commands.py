@@ -5,7 +5,7 @@ import runpy
 import shutil
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from functools import partial
 from importlib import import_module
 from pathlib import Path
@@ -17,6 +17,7 @@ from unittest import mock
 from imageio_ffmpeg import get_ffmpeg_exe
 
 from sb3_esad.zoo.hub import load_from_hub, push_to_hub
+from sb3_esad.zoo.plots import all_plots, plot
 from sb3_esad.zoo.resuming import train
 
 
@@ -52,23 +53,6 @@ def _run_script(module: str) -> None:
     runpy.run_module(module, run_name="__main__")
 
 
-def _plot(function: str) -> None:
-    from matplotlib import pyplot
-
-    screen = pyplot.get_backend().lower() != "agg"  # which is chosen where there is none
-    with nullcontext() if screen else mock.patch.object(pyplot, "show", _save_figures):
-        _call("rl_zoo3.plots", function)
-
-
-def _save_figures() -> None:
-    from matplotlib import pyplot
-
-    for label in pyplot.get_figlabels():
-        path = Path(f"{label.replace(' ', '_')}.png")
-        pyplot.figure(label).savefig(path)
-        print(f"There is no screen to show it on, so it is in {path}")
-
-
 def _record_training() -> None:
     with _ffmpeg_on_path(), mock.patch("subprocess.call", _call_or_record):
         _run_script("rl_zoo3.record_training")
@@ -98,8 +82,8 @@ COMMANDS: dict[str, Callable[[], None]] = {
     "enjoy": partial(_call, "rl_zoo3.enjoy", "enjoy"),
     "record_video": partial(_run_script, "rl_zoo3.record_video"),
     "record_training": _record_training,
-    "plot_train": partial(_plot, "plot_train"),
-    "all_plots": partial(_plot, "all_plots"),
+    "plot_train": partial(plot, "plot_train"),
+    "all_plots": all_plots,
     "push_to_hub": push_to_hub,
     "load_from_hub": load_from_hub,
 }
