@@ -306,8 +306,10 @@ def test_what_the_hub_says_is_told(
     monkeypatch.setenv("HF_TOKEN", "hf_another")
     for command, status in ((lambda: push(logs, "--no-render"), "401"), (lambda: pull(tmp_path), "404")):
         assert command() == 2
-        line = capsys.readouterr().err.splitlines()[-1]
-        assert f"{REPOSITORY}: " in line and status in line and "hf_another" not in line
+        said = capsys.readouterr()
+        line = said.err.splitlines()[-1]
+        assert f"{REPOSITORY}: " in line and status in line and "hf auth login" in line and "hf_another" not in line
+        assert "Evaluating" not in said.out, "which takes minutes, for nothing"
 
 
 def test_no_hub_within_reach(hub: LocalHub, logs: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -50,11 +50,12 @@ def push_to_hub() -> None:
     with TemporaryDirectory() as name:
         folder = Path(name)
         pack(folder, agent)
+        with _errors_on_one_line(repository):  # before the evaluation, which takes minutes
+            url = HfApi().create_repo(repository, exist_ok=True)
         if not args.no_render:
             film(folder / "replay.mp4", model, agent, args.n_timesteps)
         describe(folder, model, agent, args.episodes, repository)
         with _errors_on_one_line(repository):
-            url = HfApi().create_repo(repository, exist_ok=True)
             HfApi().upload_folder(repo_id=repository, folder_path=folder, commit_message=args.commit_message)
     print(f"Shared at {url}")
 
@@ -107,7 +108,8 @@ def _errors_on_one_line(repository: str) -> Iterator[None]:
     try:
         yield
     except (httpx2.HTTPError, OSError, RuntimeError) as error:
-        raise OSError(f"{repository}: {' '.join(str(error).split())}") from error
+        remedy = "check your connection, the name, and that you are logged in (hf auth login)"
+        raise OSError(f"{repository}: {' '.join(str(error).split())} Remedy: {remedy}.") from error
 
 
 def describe(folder: Path, model: OffPolicyAlgorithm, agent: Agent, n_episodes: int, repository: str) -> None:
