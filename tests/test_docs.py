@@ -110,6 +110,7 @@ def only_parse(monkeypatch: pytest.MonkeyPatch) -> None:
         raise Understood
 
     monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse)
+    monkeypatch.setattr("sb3_esad.zoo.plots._check_evaluations", lambda *_: None)
     monkeypatch.setattr("sb3_esad.zoo.resuming._read_run", lambda folder: {"command": [], "checkpoint_freq": 1})
 
 
