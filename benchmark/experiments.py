@@ -162,7 +162,7 @@ def train(run: Run, steps: int, episodes: int) -> None:
     script = Path(__file__).with_name("driving.py")
     what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
     how = ["--steps", str(steps), "--every", str(steps // 2), "--episodes", str(episodes), "--threads", "1"]
-    how += ["--few-updates"] * (run.arm.algorithm in IMAGINING)
+    how += ["--few-updates"] if run.arm.algorithm in IMAGINING else []
     print(f"{run.env_id}, {run.name}, seed {run.seed} ...", flush=True)
     quiet = {"stdout": subprocess.DEVNULL, "env": {**os.environ, "OMP_NUM_THREADS": "1"}}
     subprocess.run([sys.executable, str(script), *what, *how, "--out", str(run.folder)], check=True, **quiet)  # type: ignore[call-overload]

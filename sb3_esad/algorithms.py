@@ -27,7 +27,9 @@ def load_model(path: Path, trusted: bool = False) -> Any:
     :return: the model
     :raises ValueError: if the file is missing, damaged, or holds something else, or if its observations were normalised
     """
-    if any(path.parent.glob("*/vecnormalize.pkl")):
+    run = path.resolve().parent  # RL Zoo's folder ENV_N holds the statistics of a training in its folder ENV
+    env_id, numbered, _ = run.name.rpartition("_")
+    if numbered and (run / env_id / "vecnormalize.pkl").exists():
         reason = f"{path} was trained on observations that RL Zoo normalised, by statistics that lie beside it"
         raise ValueError(f"{reason}: evaluate it by python -m sb3_esad enjoy, which reads them.")
     by_class = {algorithm.__name__: algorithm for algorithm in ALGORITHMS.values()}

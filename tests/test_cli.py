@@ -92,11 +92,15 @@ def test_evaluate_a_model_of_any_algorithm(name: str, tmp_path: Path, capsys: py
 def test_a_model_that_saw_normalised_observations_is_not_judged_without(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    (tmp_path / "counting-v0").mkdir()
-    (tmp_path / "counting-v0" / "vecnormalize.pkl").touch()
-    assert main(["evaluate", "--model", str(tmp_path / "model.zip"), "--env", "counting-v0"]) == 2
+    run = tmp_path / "counting-v0_1"
+    (run / "counting-v0").mkdir(parents=True)
+    (run / "counting-v0" / "vecnormalize.pkl").touch()
+    assert main(["evaluate", "--model", str(run / "best_model.zip"), "--env", "counting-v0"]) == 2
     said = capsys.readouterr().err
     assert "normalised" in said and "python -m sb3_esad enjoy" in said
+    # Statistics of something else that lies about are no reason to refuse
+    ESADLEND("MlpPolicy", CountingEnv(), policy_kwargs=TINY, buffer_size=100).save(run / "counting-v0" / "model.zip")
+    assert type(load_model(run / "counting-v0" / "model.zip")) is ESADLEND
 
 
 def test_without_a_world_model_there_is_nothing_to_film(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
