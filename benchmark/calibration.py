@@ -30,7 +30,7 @@ class Visits(NamedTuple):
     cost_to_come: np.ndarray
 
 
-def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int) -> Visits:
+def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int, seed: int) -> Visits:
     """
     Let the policy drive, with sampled actions, as the critics mean it.
 
@@ -38,10 +38,11 @@ def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int) -> Visits:
     :param env_id: scenario
     :param n_steps: decisions in all
     :param n_envs: environments side by side
+    :param seed: of the first environment
     :return: every state after which nothing that matters was cut off
     """
     env, policy, agent = DummyVecEnv([partial(gym.make, env_id)] * n_envs), model.policy, model.policy.average
-    env.seed(UNSEEN)
+    env.seed(seed)
     observation: Any = env.reset()
     starts, latent = np.ones(n_envs, dtype=bool), policy.initial_state(n_envs)
     rows = []
@@ -116,16 +117,18 @@ def main() -> None:
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--n-envs", type=int, default=20)
+    parser.add_argument("--seed", type=int, default=UNSEEN)
     parser.add_argument("--out", type=Path, default=Path("calibration.png"))
     args = parser.parse_args()
-    visits = drive(ESADLEND.load(args.model, device="cpu"), args.env, args.steps, args.n_envs)
+    visits = drive(ESADLEND.load(args.model, device="cpu"), args.env, args.steps, args.n_envs, args.seed)
     order = np.argsort(visits.mean)
     bins = [Visits(*(column[chosen] for column in visits)) for chosen in np.array_split(order, BINS)]
     for name, each in [("all", visits), *((str(index), each) for index, each in enumerate(bins))]:
         mean, found_mean, deviation, found_deviation = figures(each)
         means = f"mean {mean:.4f} against {found_mean:.4f}"
         deviations = f"deviation {deviation:.3f} against {found_deviation:.3f}"
-        print(f"{name:>4}: {len(each.mean)} states, {means}, {deviations}")
+        came = int((each.cost_to_come >= 1).sum())
+        print(f"{name:>4}: {len(each.mean)} states, {came} of them at a cost, {means}, {deviations}")
     plot(args.out, bins)
 
 

@@ -36,11 +36,17 @@ def hazard_dream(hazard: float, steps: int, reward: float = 0.0) -> Imagination:
     return Imagination(th.ones(steps + 1, 1, *SHAPE), th.zeros(steps + 1, 1, 1), predictions, weights)
 
 
-def hazard_record(hazard: float, n: int) -> Transitions:
-    """What really happens to many lives, as drawn by chance."""
+def hazard_record(hazard: float, n: int, steps: int = 1) -> Transitions:
+    """What really happens to many lives, as drawn by chance, in windows of some steps."""
     grids, actions = state_and_action(n)
     crashes = (th.rand(n) < hazard).float()
-    return Transitions(grids, actions, grids, actions, Predictions(th.zeros(n), crashes, 1 - crashes), th.ones(n))
+    outcomes = Predictions(th.zeros(n), crashes, 1 - crashes)
+    return Transitions(grids, actions, grids, actions, outcomes, th.ones(n), followed(steps, n // steps))
+
+
+def followed(steps: int, n_windows: int) -> th.Tensor:
+    """Windows in which each step but the last is followed by another."""
+    return (th.arange(steps) < steps - 1)[:, None].expand(steps, n_windows)
 
 
 def make_cost_critic(bound: float = 1.0) -> CostCritic:
@@ -77,11 +83,12 @@ def test_hazard_chain_learned_from_dreams(hazard: float, mean: float, deviation:
 
 
 @pytest.mark.parametrize(("hazard", "mean", "deviation"), HAZARDS)
-def test_hazard_chain_learned_from_the_road(hazard: float, mean: float, deviation: float) -> None:
+@pytest.mark.parametrize("steps", [1, 16])
+def test_hazard_chain_learned_from_the_road(steps: int, hazard: float, mean: float, deviation: float) -> None:
     critic = make_cost_critic()
 
     def draw() -> CostTargets:
-        return recorded_cost_targets(critic, hazard_record(hazard, 2048), GAMMA)
+        return recorded_cost_targets(critic, hazard_record(hazard, 2048, steps), GAMMA, 0.95)
 
     learned = fit(critic, draw, n=2048)
     assert learned == pytest.approx((mean, deviation), rel=0.05)
@@ -104,11 +111,22 @@ def test_targets_of_the_mean_are_the_mean_of_the_critics() -> None:
     means, variance = critic(*state_and_action())
     assert abs(means[0] - means[1]) > 1e-4
     imagined = cost_targets(critic, dream, GAMMA, 0.95, 0.0)
-    recorded = recorded_cost_targets(critic, record, GAMMA)
+    recorded = recorded_cost_targets(critic, record, GAMMA, 0.95)
     expected_variance = (GAMMA * means.mean() - means.mean()) ** 2 + GAMMA**2 * variance
     for targets in (imagined, recorded):
         th.testing.assert_close(targets.means.flatten(), GAMMA * means.mean().expand(targets.means.numel()))
         th.testing.assert_close(targets.variances.flatten(), expected_variance.expand(targets.means.numel()))
+
+
+def test_costs_are_put_down_to_the_steps_that_led_to_them() -> None:
+    """Two windows of three steps whose last one costs; in the second an episode without a cost ended after the first step."""
+    critic, record = make_cost_critic(), hazard_record(0.0, 6, steps=3)
+    costs, goes_on = th.tensor([[0.0, 0.0], [0.0, 0.0], [1.0, 1.0]]), th.tensor([[True, False], [True, True], [False, False]])
+    outcomes = Predictions(th.zeros(6), costs.flatten(), 1 - costs.flatten())
+    targets = recorded_cost_targets(critic, record._replace(outcomes=outcomes, followed=goes_on), GAMMA, 1.0)
+    value = critic(*state_and_action())[0].mean().item()
+    expected = [[GAMMA**2, GAMMA * value], [GAMMA, GAMMA], [1.0, 1.0]]  # the same state: corrections cancel
+    th.testing.assert_close(targets.means.view(3, 2), th.tensor(expected))
 
 
 def test_decisions_fear_the_larger_estimate() -> None:
@@ -134,7 +152,7 @@ def test_return_targets_take_the_smaller_critic_and_stop_at_the_end() -> None:
     th.testing.assert_close(imagined, (3.0 + GAMMA * 0.8 * smaller).view(1, 1))
     grids, actions = state_and_action(2)
     outcomes = Predictions(th.tensor([1.0, 2.0]), th.zeros(2), th.tensor([1.0, 0.0]))
-    record = Transitions(grids, actions, grids, actions, outcomes, th.ones(2))
+    record = Transitions(grids, actions, grids, actions, outcomes, th.ones(2), followed(1, 2))
     expected = th.stack([1.0 + GAMMA * smaller, th.tensor(2.0)])
     th.testing.assert_close(recorded_return_targets(critic, record, GAMMA), expected)
 
@@ -144,7 +162,7 @@ def test_targets_have_no_gradient() -> None:
     dream = hazard_dream(0.1, 3)
     targets = [
         *cost_targets(costs, dream, GAMMA, 0.95, 0.0),
-        *recorded_cost_targets(costs, record, GAMMA),
+        *recorded_cost_targets(costs, record, GAMMA, 0.95),
         recorded_return_targets(rewards, record, GAMMA),
     ]
     assert not any(target.requires_grad for target in targets)

@@ -583,11 +583,16 @@ def test_imagination_also_starts_with_random_actions(probability: float) -> None
 
 
 def test_recorded_transitions_lead_from_before_to_after() -> None:
-    """Two windows of three steps; a state is named after its window and step, the one that it leads to by 0.5 more."""
+    """
+    Two windows of three steps; a state is named after its window and step, the one that it leads to by 0.5 more.
+
+    In the second window an episode begins with the second step.
+    """
     names = (10.0 * th.arange(2) + th.arange(3.0)[:, None])[..., None, None, None]
     before, after = (LatentState(each, each, each[..., 0, 0]) for each in (names, names + 0.5))
     gaussian = Gaussian(names, names)
-    filtered = Filtered(after, before, gaussian, gaussian, names, th.zeros(3, 2) > 0, th.zeros(3, 2) > 0)
+    is_first = th.tensor([[True, True], [False, True], [False, False]])
+    filtered = Filtered(after, before, gaussian, gaussian, names, is_first, th.zeros(3, 2) > 0)
     batch_major = names[..., 0, 0, 0].T
     samples = SimpleNamespace(
         rewards=batch_major, costs=batch_major / 100, continues=batch_major / 10, event_weights=th.tensor([1.0, 2.0])
@@ -605,6 +610,7 @@ def test_recorded_transitions_lead_from_before_to_after() -> None:
     th.testing.assert_close(recorded.outcomes.costs, now / 100)
     th.testing.assert_close(recorded.outcomes.continues, now / 10)
     th.testing.assert_close(recorded.event_weights, th.where(now < 10, 1.0, 2.0))
+    assert recorded.followed.tolist() == [[True, False], [True, True], [False, False]]
 
 
 def test_without_costs_the_multiplier_falls_and_with_them_it_rises() -> None:

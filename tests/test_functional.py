@@ -188,6 +188,31 @@ def test_variance_of_several_steps_is_a_lambda_return() -> None:
     th.testing.assert_close(one_step, F.cost_variance_target(cost, continues, q, q_next, v_next, 0.9))
 
 
+def test_corrected_return_of_the_policy_itself_is_a_lambda_return() -> None:
+    rewards, continues, values = th.rand(3, 4, 6, dtype=th.float64)
+    last = th.rand(4, 1, dtype=th.float64)
+    next_values = th.cat([values[:, 1:], last], dim=1)  # what is done next is what the policy would do
+    returns = F.corrected_return(rewards, continues, values, next_values, th.full_like(rewards, 0.8), 0.9)
+    th.testing.assert_close(returns, F.lambda_return(rewards, continues, next_values, 0.9, 0.8))
+
+
+def test_corrected_return_sums_up_surprises() -> None:
+    rewards, continues, values, next_values, traces = th.rand(5, 4, 6, dtype=th.float64)
+    surprises = rewards + 0.9 * continues * next_values - values
+    expected = values.clone()
+    for t in range(6):
+        for k in range(t, 6):
+            expected[:, t] += (0.9 * continues[:, t:k] * traces[:, t:k]).prod(dim=1) * surprises[:, k]
+    returns = F.corrected_return(rewards, continues, values, next_values, traces, 0.9)
+    th.testing.assert_close(returns, expected)
+
+
+def test_corrected_return_is_not_frightened_by_what_the_policy_would_not_do() -> None:
+    """A safe step, then a crash by an action whose cost is known; the policy would have taken a safe one."""
+    returns = F.corrected_return(t([0.0, 1.0]), t([1.0, 0.0]), t([0.3, 1.0]), t([0.0, 0.0]), t([1.0, 0.0]), 0.9)
+    assert returns.tolist() == [0.0, 1.0]
+
+
 def test_barrier_residual() -> None:
     assert F.barrier_residual(t(0.3), t(0.4), 0.1, 0.3).item() == pytest.approx(-0.01)
     assert F.barrier_residual(t(0.3), t(0.4), 0.0, 0.3).item() == pytest.approx(0.3 - 0.7 * 0.4)

@@ -42,7 +42,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param ent_coef: weight of the entropy; a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to learn it from 0.1
     :param target_entropy: entropy that a learned weight maintains, in nats; ``"auto"`` for minus the size of the action
     :param replay_critic_coef: weight of recorded transitions in the loss of the reward critics
-    :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics
+    :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics, beside 1 of imagined ones,
+        which foresee too many costs
     :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
@@ -64,7 +65,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         ent_coef: str | float = "auto_0.03",
         target_entropy: str | float = "auto",
         replay_critic_coef: float = 0.3,
-        replay_cost_critic_coef: float = 1.0,
+        replay_cost_critic_coef: float = 10.0,
         uniform_action_prob: float = 0.3,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -126,7 +127,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         continue_after_cost = self._raise_cost_bound()
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
         targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost)
+        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost, self.lambda_return)
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)

@@ -9,11 +9,7 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_esad.common.critics import CostCritic, CostTargets, QEnsemble
-from sb3_esad.common.functional import (
-    expected_squared_error,
-    indicator_joint,
-    lambda_return,
-)
+from sb3_esad.common.functional import corrected_return, expected_squared_error, indicator_joint, lambda_return
 from sb3_esad.common.imagined_returns import reached, taken
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.rssm import Filtered
@@ -22,7 +18,7 @@ from sb3_esad.common.type_aliases import Imagination, Predictions, SequenceSampl
 
 class Transitions(NamedTuple):
     """
-    N steps with the states before and after.
+    N = T * B recorded steps, time-major, with the states before and after.
 
     :param grids: features of the states, of shape (N, C, H, W)
     :param actions: executed in them, of shape (N, A)
@@ -30,6 +26,7 @@ class Transitions(NamedTuple):
     :param next_actions: of the present policy, of shape (N, A)
     :param outcomes: reward, cost and continuation of the step, fields of shape (N,)
     :param event_weights: correct the over-representation of costs, of shape (N,)
+    :param followed: whether the next step of the window goes on from the state reached, of shape (T, B)
     """
 
     grids: th.Tensor
@@ -38,6 +35,7 @@ class Transitions(NamedTuple):
     next_actions: th.Tensor
     outcomes: Predictions
     event_weights: th.Tensor
+    followed: th.Tensor
 
 
 @th.no_grad()
@@ -54,7 +52,8 @@ def recorded_transitions(policy: LatentPolicy, samples: SequenceSamples, filtere
     grids, next_grids = policy.world_model.features(before), policy.world_model.features(after)
     outcomes = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
     weights = samples.event_weights.expand_as(samples.rewards.T).flatten()
-    return Transitions(grids, before.action, next_grids, policy.actor(next_grids), outcomes, weights)
+    followed = th.cat([~filtered.is_first[1:], th.zeros_like(filtered.is_first[:1])])
+    return Transitions(grids, before.action, next_grids, policy.actor(next_grids), outcomes, weights, followed)
 
 
 @th.no_grad()
@@ -97,14 +96,27 @@ def recorded_return_targets(critic: QEnsemble, recorded: Transitions, gamma: flo
     return rewards + gamma * continues * critic(recorded.next_grids, recorded.next_actions).min(0).values
 
 
-def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: float) -> CostTargets:
+@th.no_grad()
+def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: float, lambda_: float) -> CostTargets:
     """
-    One-step targets of the cost critics from what really happened: they keep the critics honest when the model is not.
+    Corrected returns of what really happened: they keep the critics honest when the model is not.
+
+    One-step targets would be outvoted by dreams, in which ten predicted costs add up (docs/experiments.md, section 18).
 
     :param critic: ensemble to bootstrap from
     :param recorded: N transitions
     :param gamma: discount of the cost
+    :param lambda_: mixing of n-step returns
     :return: fields of shape (N,)
     """
-    taken_there, reached_there = (recorded.grids, recorded.actions), (recorded.next_grids, recorded.next_actions)
-    return critic.targets(taken_there, reached_there, recorded.outcomes.costs, recorded.outcomes.continues, gamma)
+    means, variance = critic(recorded.grids, recorded.actions)
+    next_means, next_variance = critic(recorded.next_grids, recorded.next_actions)
+    _, costs, continues = recorded.outcomes
+    fields = (costs, continues, means.mean(0), variance, next_means.mean(0), next_variance)
+    costs, continues, mean, variance, next_mean, next_variance = (field.view_as(recorded.followed).T for field in fields)
+    traces = lambda_ * recorded.followed.T
+    error = (costs + gamma * continues * next_mean - mean) ** 2
+    costs_to_come = corrected_return(costs, continues, mean, next_mean, traces, gamma)
+    # What a later action was known to risk is taken off, and may be more than what is left
+    variance_to_come = corrected_return(error, continues, variance, next_variance, traces, gamma**2).clamp(min=0)
+    return CostTargets(costs_to_come.T.flatten(), variance_to_come.T.flatten())
