@@ -27,6 +27,7 @@ class Visits(NamedTuple):
 
     mean: np.ndarray
     variance: np.ndarray
+    cost: np.ndarray
     cost_to_come: np.ndarray
 
 
@@ -58,7 +59,7 @@ def drive(model: ESADLEND, env_id: str, n_steps: int, n_envs: int, seed: int) ->
         rows.append((means.mean(0).numpy(), variance.numpy(), costs, starts, np.array(cut)))
     mean, variance, costs, dones, cuts = (np.array(column) for column in zip(*rows, strict=True))
     to_come, known = cost_to_come(costs, dones, cuts, model.gamma if model.cost_gamma is None else model.cost_gamma)
-    return Visits(mean[known], variance[known], to_come[known])
+    return Visits(mean[known], variance[known], costs[known], to_come[known])
 
 
 def cost_to_come(costs: np.ndarray, dones: np.ndarray, cuts: np.ndarray, gamma: float) -> tuple[np.ndarray, np.ndarray]:
@@ -127,8 +128,7 @@ def main() -> None:
         mean, found_mean, deviation, found_deviation = figures(each)
         means = f"mean {mean:.4f} against {found_mean:.4f}"
         deviations = f"deviation {deviation:.3f} against {found_deviation:.3f}"
-        came = int((each.cost_to_come >= 1).sum())
-        print(f"{name:>4}: {len(each.mean)} states, {came} of them at a cost, {means}, {deviations}")
+        print(f"{name:>4}: {len(each.mean)} states, {np.count_nonzero(each.cost)} costs, {means}, {deviations}")
     plot(args.out, bins)
 
 

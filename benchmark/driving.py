@@ -112,23 +112,22 @@ class LearningCurve(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._next, self._seconds, self._resumed = self.every, 0.0, time.monotonic()
-        self._cost, self._episodes, self._evaluated = 0.0, 0, 0
+        self._cost, self._episodes = 0.0, 0
 
     def _on_step(self) -> bool:
         self._cost += sum(info["cost"] for info in self.locals["infos"])
         self._episodes += int(self.locals["dones"].sum())
-        if self.num_timesteps >= self._next:
+        is_last = self.num_timesteps >= self.locals["total_timesteps"]  # the updates that follow belong to the last evaluation
+        if self.num_timesteps >= self._next and not is_last:
             self._next += self.every
             self._evaluate()
         return True
 
     def _on_training_end(self) -> None:
-        if self.num_timesteps > self._evaluated:
-            self._evaluate()
+        self._evaluate()
 
     def _evaluate(self) -> None:
         self._seconds += time.monotonic() - self._resumed
-        self._evaluated = self.num_timesteps
         line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
         line |= {"training_cost": self._cost, "training_episodes": self._episodes}
         for name, deterministic in (("best", True), ("sampled", False)):

@@ -88,9 +88,10 @@ EXPERIMENTS = {
         "Are recorded costs needed, and more of them than there were?",
         (HIGHWAY,),
         {
-            "both": Arm("esad_lend", {}),
+            "above all recorded ones": Arm("esad_lend", {}),
             "critics from imagination alone": Arm("esad_lend", {"replay_cost_critic_coef": 0.0}),
-            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0}}),
+            "both alike": Arm("esad_lend", {"replay_cost_critic_coef": 1.0}),
+            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0, "recency": 3.0}}),
         },
     ),
     "E9": Experiment(

@@ -129,6 +129,78 @@ def test_costs_are_put_down_to_the_steps_that_led_to_them() -> None:
     th.testing.assert_close(targets.means.view(3, 2), th.tensor(expected))
 
 
+def random_record(steps: int, n_windows: int) -> Transitions:
+    """Windows in which every state and every action is another one."""
+    n = steps * n_windows
+    grids, next_grids = th.randn(2, n, *SHAPE)
+    actions, next_actions = 2 * th.rand(2, n, 1) - 1
+    costs = (th.rand(n) < 0.3).float()
+    outcomes = Predictions(th.zeros(n), costs, 1 - costs)
+    return Transitions(grids, actions, next_grids, next_actions, outcomes, th.ones(n), followed(steps, n_windows))
+
+
+def make_lively_critic() -> CostCritic:
+    critic = make_cost_critic()
+    for network in (*critic.means, critic.variance):
+        th.nn.init.normal_(network[-1].weight)
+        th.nn.init.zeros_(network[-1].bias)
+    return critic
+
+
+def test_without_traces_recorded_targets_are_those_of_one_step() -> None:
+    critic, record = make_lively_critic(), random_record(steps=3, n_windows=5)
+    taken, reached = (record.grids, record.actions), (record.next_grids, record.next_actions)
+    expected = critic.targets(taken, reached, record.outcomes.costs, record.outcomes.continues, GAMMA)
+    for target, one_step in zip(recorded_cost_targets(critic, record, GAMMA, 0.0), expected, strict=True):
+        th.testing.assert_close(target, one_step)
+
+
+def test_recorded_targets_step_by_step() -> None:
+    critic, record = make_lively_critic(), random_record(steps=3, n_windows=1)
+    with th.no_grad():
+        (means, variances), (next_means, next_variances) = (
+            critic(record.grids, record.actions),
+            critic(record.next_grids, record.next_actions),
+        )
+    q, v, next_q, next_v = (each.tolist() for each in (means.mean(0), variances, next_means.mean(0), next_variances))
+    cost_to_come, variance_to_come = [0.0] * 3, [0.0] * 3
+    for t in (2, 1, 0):
+        cost, goes_on = record.outcomes.costs[t].item(), record.outcomes.continues[t].item()
+        later = (0.8 * (cost_to_come[t + 1] - q[t + 1]), 0.8 * (variance_to_come[t + 1] - v[t + 1])) if t < 2 else (0.0, 0.0)
+        cost_to_come[t] = cost + GAMMA * goes_on * (next_q[t] + later[0])
+        error = (cost + GAMMA * goes_on * next_q[t] - q[t]) ** 2
+        variance_to_come[t] = error + GAMMA**2 * goes_on * (next_v[t] + later[1])
+    targets = recorded_cost_targets(critic, record, GAMMA, 0.8)
+    assert targets.means.tolist() == pytest.approx(cost_to_come, abs=1e-5)
+    assert targets.variances.tolist() == pytest.approx([max(variance, 0.0) for variance in variance_to_come], abs=1e-5)
+
+
+def test_what_the_policy_would_not_do_is_not_feared() -> None:
+    """
+    Half of what was recorded crashed in the second step, by an action that the policy never takes.
+
+    A return without correction expects .475 of the first step.
+    """
+    n = 64
+    grids, next_grids = th.cat([th.ones(n, *SHAPE), -th.ones(n, *SHAPE)]), -th.ones(2 * n, *SHAPE)
+    reckless = th.cat([th.zeros(n), (th.arange(n) % 2).float()])
+    outcomes = Predictions(th.zeros(2 * n), reckless, th.cat([th.ones(n), th.zeros(n)]))
+    actions = reckless[:, None]
+    record = Transitions(grids, actions, next_grids, 0 * actions, outcomes, th.ones(2 * n), followed(2, n))
+    critic = make_cost_critic()
+    optimizer = th.optim.Adam(critic.parameters(), lr=0.02)
+    for _ in range(300):
+        loss = sum(critic.loss(grids, actions, *recorded_cost_targets(critic, record, GAMMA, 1.0)))
+        optimizer.zero_grad()
+        cast(th.Tensor, loss).mean().backward()
+        optimizer.step()
+    means, variances = critic(th.stack([grids[0], grids[-1], grids[-1]]), th.tensor([[0.0], [0.0], [1.0]]))
+    assert means.mean(0).tolist() == pytest.approx([0.0, 0.0, 1.0], abs=0.03), (
+        "a return without correction gives .475 at first"
+    )
+    assert variances.sqrt().tolist() == pytest.approx([0.0, 0.0, 0.0], abs=0.1)
+
+
 def test_decisions_fear_the_larger_estimate() -> None:
     critic = make_cost_critic()
     means, _ = critic(*state_and_action())

@@ -132,16 +132,18 @@ def corrected_return(
     rewards: th.Tensor, continues: th.Tensor, values: th.Tensor, next_values: th.Tensor, traces: th.Tensor, gamma: float
 ) -> th.Tensor:
     """
-    Mixture of n-step returns along what another policy did, corrected by what the present one would do (Q(lambda) with
-    off-policy corrections, Harutyunyan et al. 2016, Eq. 3).
+    Mixture of n-step returns along what another policy did, corrected by what the present one would do.
+
+    Q(lambda) with off-policy corrections (Harutyunyan et al. 2016, arXiv 1602.04951).
 
     y_t = r_t + gamma k_t v_t + gamma k_t l_t (y_{t+1} - q_{t+1}): what a later action earns more or less than the present
-    policy's own is known to q, and not put down to the steps before it.
+    policy's own is known to q, and not put down to the steps before it. As far as it is not known it is, until q has learned
+    it; where policies differ much nothing but slow targets keeps that from swinging.
 
     :param rewards: (..., T), reward or cost of each step
     :param continues: (..., T), 0 where the step ended the episode, 1 elsewhere
     :param values: (..., T), q of each state and the action that was taken in it
-    :param next_values: (..., T), v of the state that the step reached and an action of the present policy
+    :param next_values: (..., T), v of the state that the step reached, q of an action of the present policy if sampled
     :param traces: (..., T), l in [0, 1], how much what follows the step may say about it; 0 is the one-step target
     :param gamma: discount
     :return: (..., T)

@@ -43,7 +43,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param target_entropy: entropy that a learned weight maintains, in nats; ``"auto"`` for minus the size of the action
     :param replay_critic_coef: weight of recorded transitions in the loss of the reward critics
     :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics, beside 1 of imagined ones,
-        which foresee too many costs
+        which foresee too many costs; their returns are mixed by ``lambda_return``, too
     :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
@@ -131,13 +131,14 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
-        dreamed = (weights * (mean_loss + variance_loss)).mean()
-        anchored = (recorded.event_weights * (anchor_mean_loss + anchor_variance_loss)).mean()
-        self._step("cost_critic", dreamed + self.replay_cost_critic_coef * anchored)
+        dreamed = [(weights * loss).mean() for loss in (mean_loss, variance_loss)]
+        anchored = [(recorded.event_weights * loss).mean() for loss in (anchor_mean_loss, anchor_variance_loss)]
+        self._step("cost_critic", sum(dreamed) + self.replay_cost_critic_coef * sum(anchored))
         return {
-            "cost_critic_loss": (weights * mean_loss).mean().item(),
-            "cost_var_loss": (weights * variance_loss).mean().item(),
-            "replay_cost_critic_loss": anchor_mean_loss.mean().item(),
+            "cost_critic_loss": dreamed[0].item(),
+            "cost_var_loss": dreamed[1].item(),
+            "replay_cost_critic_loss": anchored[0].item(),
+            "replay_cost_var_loss": anchored[1].item(),
             "imagination/cost": targets.means[0].mean().item(),
         }
 

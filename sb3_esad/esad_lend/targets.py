@@ -25,7 +25,7 @@ class Transitions(NamedTuple):
     :param next_grids: features of the states reached, of shape (N, C, H, W)
     :param next_actions: of the present policy, of shape (N, A)
     :param outcomes: reward, cost and continuation of the step, fields of shape (N,)
-    :param event_weights: correct the over-representation of costs, of shape (N,)
+    :param event_weights: correct the over-representation of costs and of what is old, of shape (N,)
     :param followed: whether the next step of the window goes on from the state reached, of shape (T, B)
     """
 
@@ -46,7 +46,7 @@ def recorded_transitions(policy: LatentPolicy, samples: SequenceSamples, filtere
     :param policy: draws the next actions
     :param samples: windows
     :param filtered: their states
-    :return: B * T transitions
+    :return: T * B transitions
     """
     before, after = (state.map(lambda field: field.flatten(0, 1)) for state in (filtered.before, filtered.states))
     grids, next_grids = policy.world_model.features(before), policy.world_model.features(after)
@@ -101,7 +101,9 @@ def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: floa
     """
     Corrected returns of what really happened: they keep the critics honest when the model is not.
 
-    One-step targets would be outvoted by dreams, in which ten predicted costs add up (docs/experiments.md, section 18).
+    Mean and variance (Sherstan et al. 2018) by the same recursion, the latter over squared one-step errors with gamma^2.
+    One-step targets would be outvoted by dreams, in which ten predicted costs add up, and follow them slowly; returns without
+    the correction blame a policy for what it would not do (docs/experiments.md, section 18).
 
     :param critic: ensemble to bootstrap from
     :param recorded: N transitions
@@ -117,6 +119,7 @@ def recorded_cost_targets(critic: CostCritic, recorded: Transitions, gamma: floa
     traces = lambda_ * recorded.followed.T
     error = (costs + gamma * continues * next_mean - mean) ** 2
     costs_to_come = corrected_return(costs, continues, mean, next_mean, traces, gamma)
-    # What a later action was known to risk is taken off, and may be more than what is left
+    # Negative where corrections exceed what is left. Cut like means outside [0, bound], in CostCritic.loss: that leaves a
+    # little of what was corrected, and keeps critics that are wrong from driving each other on
     variance_to_come = corrected_return(error, continues, variance, next_variance, traces, gamma**2).clamp(min=0)
     return CostTargets(costs_to_come.T.flatten(), variance_to_come.T.flatten())
