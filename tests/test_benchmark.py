@@ -1,13 +1,17 @@
 """Every script of benchmark/ starts, and says what it does."""
 
+import json
 import re
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from stable_baselines3 import SAC
 
+import benchmark.driving
 from benchmark.upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_AD_END, DOES_NOT_APPLY_TO_LATENTS
+from tests.conftest import CountingEnv
 
 SCRIPTS = sorted((Path(__file__).parents[1] / "benchmark").glob("*.py"))
 
@@ -26,6 +30,18 @@ def test_what_does_not_apply_is_told() -> None:
         for pattern, reason in reasons.items():
             (row,) = (row for row in rows if f"| {concerned} | {reason} |" in row and names_one_of(row, pattern))
             assert row.startswith("| `test_")
+
+
+@pytest.mark.parametrize(("total", "steps"), [(20, [8, 16, 20]), (16, [8, 16])])
+def test_a_learning_curve_has_one_point_at_the_end(
+    total: int, steps: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(benchmark.driving, "evaluate_model", lambda *args: [])
+    monkeypatch.setattr(benchmark.driving, "summarise", lambda records: {})
+    curve = benchmark.driving.LearningCurve(tmp_path / "curve.jsonl", "CountingEnv", every=8, seeds=range(1))
+    SAC("MlpPolicy", CountingEnv(), learning_starts=100, buffer_size=100, train_freq=4).learn(total, callback=curve)
+    lines = (tmp_path / "curve.jsonl").read_text().splitlines()
+    assert [json.loads(line)["steps"] for line in lines] == steps
 
 
 def names_one_of(row: str, pattern: str) -> bool:
