@@ -24,10 +24,19 @@ from sb3_esad.video import check_image, record_model, video_writer
 
 ENV_ID = "esad-highway-v0"
 TIMESTEPS, MINUTES = 20_000, 8.0
-FEW_UPDATES = {"learning_rate": FALLING_RATE, "train_freq": 32, "learning_starts": 3_000, "pretrain_gradient_steps": 0}
+FEW_UPDATES = {
+    "learning_rate": FALLING_RATE,
+    "train_freq": 32,
+    "learning_starts": 3_000,
+    "pretrain_gradient_steps": 0,
+    "replay_buffer_kwargs": {},
+    "replay_cost_critic_coef": 1.0,
+    "replay_lambda": 0.0,
+}
 """
 In hundreds of updates a rate that falls from the start moves the networks too little, and steps, which take hardly any time,
-teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13).
+teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13). And critics that
+fear too much are safer than those that expect what comes of a policy that still changes quickly (section 18).
 """
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""

@@ -43,7 +43,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param target_entropy: entropy that a learned weight maintains, in nats; ``"auto"`` for minus the size of the action
     :param replay_critic_coef: weight of recorded transitions in the loss of the reward critics
     :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics, beside 1 of imagined ones,
-        which foresee too many costs; their returns are mixed by ``lambda_return``, too
+        which foresee too many costs
+    :param replay_lambda: mixing of n-step returns of recorded costs, in [0, 1]
     :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
@@ -66,6 +67,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         target_entropy: str | float = "auto",
         replay_critic_coef: float = 0.3,
         replay_cost_critic_coef: float = 10.0,
+        replay_lambda: float = 0.95,
         uniform_action_prob: float = 0.3,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -75,6 +77,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         self.target_entropy = target_entropy
         self.replay_critic_coef = replay_critic_coef
         self.replay_cost_critic_coef = replay_cost_critic_coef
+        self.replay_lambda = replay_lambda
         self.uniform_action_prob = uniform_action_prob
         if _init_setup_model:
             self._setup_model()
@@ -83,6 +86,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         super()._check_arguments()
         uniform = self.uniform_action_prob
         require(0 <= uniform <= 1, "uniform_action_prob", uniform, "a probability in [0, 1]")
+        require(0 <= self.replay_lambda <= 1, "replay_lambda", self.replay_lambda, "a number in [0, 1]")
         for name in ("replay_critic_coef", "replay_cost_critic_coef"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "a weight >= 0")
         target, remedy = self.target_entropy, 'a number of nats, or "auto"'
@@ -127,7 +131,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         continue_after_cost = self._raise_cost_bound()
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
         targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost, self.lambda_return)
+        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost, self.replay_lambda)
         weights = imagined.weights.flatten()
         mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
         anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
