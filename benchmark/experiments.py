@@ -61,6 +61,12 @@ def diffusion(steps: int) -> dict[str, Any]:
     return {"policy_kwargs": {"head_kwargs": {"diffusion_steps": steps}}}
 
 
+RECORDED: dict[str, Any] = {
+    "replay_cost_critic_coef": 10.0,
+    "replay_lambda": 0.95,
+    "replay_buffer_kwargs": {"recency": 3.0},
+}
+"""As with the settings of hyperparams/, which the demo's budget, that of all arms that imagine, replaces."""
 FILTER: dict[str, Any] = {"filter_start": 300}
 BARRIER: dict[str, Any] = {"barrier_coef": 1.0}
 EXPERIMENTS = {
@@ -88,10 +94,10 @@ EXPERIMENTS = {
         "Are recorded costs needed, and more of them than there were?",
         (HIGHWAY,),
         {
-            "above all recorded ones": Arm("esad_lend", {}),
+            "both": Arm("esad_lend", {}),
             "critics from imagination alone": Arm("esad_lend", {"replay_cost_critic_coef": 0.0}),
-            "both alike": Arm("esad_lend", {"replay_cost_critic_coef": 1.0}),
-            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0, "recency": 3.0}}),
+            "above all recorded windows": Arm("esad_lend", RECORDED),
+            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0}}),
         },
     ),
     "E9": Experiment(

@@ -35,8 +35,9 @@ FEW_UPDATES = {
 }
 """
 In hundreds of updates a rate that falls from the start moves the networks too little, and steps, which take hardly any time,
-teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13). And critics that
-fear too much are safer than those that expect what comes of a policy that still changes quickly (section 18).
+teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13). And with
+critics that expect what comes one of three seeds was at 83 % without a collision, with those that fear too much all were at
+96 and more (section 18).
 """
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
