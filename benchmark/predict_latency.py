@@ -1,7 +1,13 @@
-"""How long ``predict`` takes on one thread, with and without the filter: ``python benchmark/predict_latency.py``."""
+"""
+How long ``predict`` takes on one thread, with and without the filter: ``python benchmark/predict_latency.py``.
+
+The filter imagines one action where that is admissible and five where it is not. Untrained critics fear everything, so that
+each action is replaced, which takes longest. With ``--model`` a trained policy tells how long it usually takes.
+"""
 
 import argparse
 import time
+from pathlib import Path
 
 import gymnasium as gym
 import numpy as np
@@ -10,23 +16,38 @@ import torch as th
 from sb3_esad import ESADLEND
 from sb3_esad.common.selection import SafetyFilter
 
+ENV_ID = "esad-highway-v0"
 ARMS = {"without filter": None, "8 scenarios, 16 proposals, 3 steps": 0}
 """When the filter starts."""
 
 
-def times(filter_start: int | None, steps: int) -> np.ndarray:
+def load(path: Path | None, filter_start: int | None) -> ESADLEND:
     """
-    Drive with an untrained policy.
+    Give the driver.
 
+    :param path: of a trained model, None for an untrained one
     :param filter_start: when the filter starts, None for never
+    :return: the driver; its filter, if it has one, is at work
+    """
+    if path is None:
+        env = gym.make(ENV_ID)
+        model = ESADLEND("CnnPolicy", env, buffer_size=1000, filter_start=filter_start, barrier_steps=3, seed=0)
+    else:
+        model = ESADLEND.load(path, device="cpu", filter_start=filter_start, barrier_steps=3)
+    if isinstance(model.policy.action_filter, SafetyFilter):
+        model.policy.action_filter.is_active = lambda: True
+    return model
+
+
+def times(model: ESADLEND, steps: int) -> np.ndarray:
+    """
+    Drive.
+
+    :param model: decides
     :param steps: decisions
     :return: what each takes [ms]
     """
-    env = gym.make("esad-highway-v0")
-    model = ESADLEND("CnnPolicy", env, buffer_size=1000, filter_start=filter_start, barrier_steps=3, seed=0)
-    if isinstance(model.policy.action_filter, SafetyFilter):
-        # An untrained critic fears everything: each action is replaced, which takes longest
-        model.policy.action_filter.is_active = lambda: True
+    env = gym.make(ENV_ID)
     observation, state, start, taken = env.reset(seed=0)[0], None, np.array([True]), []
     for _ in range(steps):
         begin = time.perf_counter()
@@ -41,12 +62,13 @@ def times(filter_start: int | None, steps: int) -> np.ndarray:
 
 def main() -> None:
     """Print the median and the 99th percentile of both."""
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--model", type=Path, help="trained on the same scenario (default: an untrained one)")
     parser.add_argument("--steps", type=int, default=1000)
     args = parser.parse_args()
     th.set_num_threads(1)
     for name, filter_start in ARMS.items():
-        warm = times(filter_start, args.steps)
+        warm = times(load(args.model, filter_start), args.steps)
         print(
             f"predict, {name}: median {np.median(warm):.2f} ms, 99th percentile {np.percentile(warm, 99):.2f} ms", flush=True
         )

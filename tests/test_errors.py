@@ -98,6 +98,7 @@ def test_missing_costs_are_zero_with_one_warning() -> None:
         ("replay_critic_coef", -1.0, ">= 0"),
         ("replay_cost_critic_coef", -1.0, ">= 0"),
         ("replay_lambda", 1.5, "in [0, 1]"),
+        ("min_cost_critic_rate", -0.1, "in [0, 1]"),
         ("target_entropy", "low", '"auto"'),
         ("lambda_lr", -0.1, ">= 0"),
         ("penalty_coef", -0.1, ">= 0"),

@@ -109,6 +109,21 @@ def test_each_update_moves_one_network() -> None:
             assert same == (each != name)
 
 
+def test_cost_critics_learn_what_a_policy_costs_that_stays() -> None:
+    """Costs after 3 and 6 of 7 steps, whatever is done: .53 to come at a discount of .5, on average over the steps."""
+    model = make_model(cost_gamma=0.5, replay_cost_critic_coef=100.0, learning_rate=0.005).learn(40)
+    kept = [name for name in NETWORKS if name != "cost_critic"]
+    before = {name: th.nn.utils.parameters_to_vector(getattr(model.policy, name).parameters()) for name in kept}
+    model.fit_cost_critic(300)
+    for name, vector in before.items():
+        assert th.equal(vector, th.nn.utils.parameters_to_vector(getattr(model.policy, name).parameters()))
+    samples, filtered, _ = imagine(model)
+    recorded = recorded_transitions(model.policy, samples, filtered)
+    with th.no_grad():
+        means, _ = model.policy.cost_critic_target(recorded.grids, recorded.actions)
+    assert means.mean().item() == pytest.approx(0.53, abs=0.1)
+
+
 def test_critics_do_not_learn_through_the_dream() -> None:
     model = make_model().learn(24)
     samples, filtered, imagined = imagine(model)
@@ -163,7 +178,7 @@ def test_the_rate_is_the_third_argument_as_everywhere_in_sb3() -> None:
 
 def test_the_rate_is_held_and_falls_to_zero() -> None:
     assert [FALLING_RATE(progress) for progress in (1.0, 0.5, 0.25, 0.0, -0.1)] == pytest.approx([0.006, 0.006, 0.003, 0, 0])
-    model = make_model(learning_rate=FALLING_RATE)
+    model = make_model(learning_rate=FALLING_RATE, min_cost_critic_rate=0.0)
     assert inspect.signature(ESADLEND.__mro__[1]).parameters["learning_rate"].default is FALLING_RATE
     assert {group["lr"] for each in model._optimizers().values() for group in each.param_groups} == {0.006}
     model.learn(40)
@@ -541,7 +556,16 @@ def test_learning_rate_schedule_reaches_every_optimiser() -> None:
     model = make_model(learning_rate=lambda remaining: 1e-3 * (0.1 + remaining), ent_coef="auto").learn(40)
     rates = {name: optimizer.param_groups[0]["lr"] for name, optimizer in model._optimizers().items()}
     assert set(rates) == {*(f"policy.{name}.optimizer" for name in NETWORKS), "entropy.optimizer"}
-    assert list(rates.values()) == pytest.approx([1e-4] * 5)
+    # What judges the policy goes on where the policy stops
+    assert rates.pop("policy.cost_critic.optimizer") == pytest.approx(1.1e-3 / 3)
+    assert list(rates.values()) == pytest.approx([1e-4] * 4)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_share_of_the_rate_that_the_cost_critics_keep(share: float) -> None:
+    model = make_model(learning_rate=lambda remaining: 1e-3 * (0.1 + remaining), min_cost_critic_rate=share).learn(40)
+    (group,) = model.policy.cost_critic.optimizer.param_groups
+    assert group["lr"] == pytest.approx(max(1e-4, share * 1.1e-3))
 
 
 @pytest.mark.parametrize(("ent_coef", "initial"), [("auto", 1.0), ("auto_0.01", 0.01), (0.3, 0.3)])

@@ -5,7 +5,8 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_esad.common.agent import LatentAgent
-from sb3_esad.common.functional import barrier_residual, lambda_return
+from sb3_esad.common.functional import barrier_residual
+from sb3_esad.common.returns import lambda_return
 from sb3_esad.common.type_aliases import LatentState
 
 

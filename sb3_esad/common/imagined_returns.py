@@ -3,7 +3,7 @@
 import torch as th
 
 from sb3_esad.common.critics import CostCritic, QEnsemble
-from sb3_esad.common.functional import lambda_return
+from sb3_esad.common.returns import lambda_return
 from sb3_esad.common.type_aliases import Imagination
 
 

@@ -13,6 +13,7 @@ from sb3_esad.common.functional import rising_cvar
 from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns, taken
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
 from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
@@ -45,6 +46,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param replay_cost_critic_coef: weight of recorded transitions in the loss of the cost critics, beside 1 of imagined ones,
         which foresee too many costs
     :param replay_lambda: mixing of n-step returns of recorded costs, in [0, 1]
+    :param min_cost_critic_rate: share of the first learning rate below which that of the cost critics does not fall, so that
+        they catch up with a policy that hardly moves any more
     :param uniform_action_prob: probability that an imagined trajectory starts with a uniformly random action
     :param kwargs: see :class:`ConstrainedLatentAlgorithm`
     :raises ValueError: if an argument is out of its range
@@ -68,6 +71,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         replay_critic_coef: float = 0.3,
         replay_cost_critic_coef: float = 10.0,
         replay_lambda: float = 0.95,
+        min_cost_critic_rate: float = 1 / 3,
         uniform_action_prob: float = 0.3,
         _init_setup_model: bool = True,
         **kwargs: Any,
@@ -78,6 +82,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         self.replay_critic_coef = replay_critic_coef
         self.replay_cost_critic_coef = replay_cost_critic_coef
         self.replay_lambda = replay_lambda
+        self.min_cost_critic_rate = min_cost_critic_rate
         self.uniform_action_prob = uniform_action_prob
         if _init_setup_model:
             self._setup_model()
@@ -89,6 +94,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         require(0 <= self.replay_lambda <= 1, "replay_lambda", self.replay_lambda, "a number in [0, 1]")
         for name in ("replay_critic_coef", "replay_cost_critic_coef"):
             require(getattr(self, name) >= 0, name, getattr(self, name), "a weight >= 0")
+        share = self.min_cost_critic_rate
+        require(0 <= share <= 1, "min_cost_critic_rate", share, "a share of the first learning rate in [0, 1]")
         target, remedy = self.target_entropy, 'a number of nats, or "auto"'
         require(target == "auto" or isinstance(target, int | float), "target_entropy", target, remedy)
 
@@ -96,6 +103,12 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         super()._setup_model()
         target = -float(self.policy.actor.action_dim) if self.target_entropy == "auto" else float(self.target_entropy)
         self.entropy = make_entropy_coefficient(self.ent_coef, target, self.lr_schedule(1)).to(self.device)
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        super()._update_learning_rate(optimizers)
+        least = self.min_cost_critic_rate * self.lr_schedule(1)
+        for group in self.policy.cost_critic.optimizer.param_groups:
+            group["lr"] = max(group["lr"], least)
 
     def _first_actions(self, start: LatentState) -> th.Tensor:
         # The critics must know what actions lead to that the policy would never take
@@ -145,6 +158,26 @@ class ESADLEND(ConstrainedLatentAlgorithm):
             "replay_cost_var_loss": anchored[1].item(),
             "imagination/cost": targets.means[0].mean().item(),
         }
+
+    def fit_cost_critic(self, gradient_steps: int) -> None:
+        """
+        Let the cost critics alone learn what the present policy costs, as policy evaluation does between two improvements.
+
+        Nothing happens before ``learning_starts`` steps have been collected.
+
+        :param gradient_steps: number of updates
+        """
+        if not self._has_enough_steps():
+            return
+        self.policy.set_training_mode(True)
+        self._update_learning_rate(self.policy.cost_critic.optimizer)
+        for _ in range(gradient_steps):
+            samples = self._sample(self.batch_size)
+            with th.no_grad(), autocast(self.device):
+                filtered = self.policy.world_model.observe(samples, th.zeros_like(samples.rewards.T, dtype=th.bool))
+                imagined = self._imagine(samples, filtered)
+            with autocast(self.device):
+                self._update_cost_critic(imagined, recorded_transitions(self.policy, samples, filtered))
 
     def _update_actor(self, imagined: Imagination) -> Logs:
         """

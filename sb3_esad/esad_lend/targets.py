@@ -9,9 +9,10 @@ from typing import NamedTuple
 import torch as th
 
 from sb3_esad.common.critics import CostCritic, CostTargets, QEnsemble
-from sb3_esad.common.functional import corrected_return, expected_squared_error, indicator_joint, lambda_return
+from sb3_esad.common.functional import expected_squared_error, indicator_joint
 from sb3_esad.common.imagined_returns import reached, taken
 from sb3_esad.common.policies import LatentPolicy
+from sb3_esad.common.returns import corrected_return, lambda_return
 from sb3_esad.common.rssm import Filtered
 from sb3_esad.common.type_aliases import Imagination, Predictions, SequenceSamples
 
