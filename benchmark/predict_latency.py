@@ -8,6 +8,7 @@ each action is replaced, which takes longest. With ``--model`` a trained policy 
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import gymnasium as gym
 import numpy as np
@@ -19,6 +20,7 @@ from sb3_esad.common.selection import SafetyFilter
 ENV_ID = "esad-highway-v0"
 ARMS = {"without filter": None, "8 scenarios, 16 proposals, 3 steps": 0}
 """When the filter starts."""
+SIZES: dict[str, Any] = {"n_candidates": 8, "n_proposals": 16, "barrier_steps": 3}
 
 
 def load(path: Path | None, filter_start: int | None) -> ESADLEND:
@@ -31,9 +33,9 @@ def load(path: Path | None, filter_start: int | None) -> ESADLEND:
     """
     if path is None:
         env = gym.make(ENV_ID)
-        model = ESADLEND("CnnPolicy", env, buffer_size=1000, filter_start=filter_start, barrier_steps=3, seed=0)
+        model = ESADLEND("CnnPolicy", env, buffer_size=1000, seed=0, filter_start=filter_start, **SIZES)
     else:
-        model = ESADLEND.load(path, device="cpu", filter_start=filter_start, barrier_steps=3)
+        model = ESADLEND.load(path, device="cpu", filter_start=filter_start, **SIZES)
     if isinstance(model.policy.action_filter, SafetyFilter):
         model.policy.action_filter.is_active = lambda: True
     return model

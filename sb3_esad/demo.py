@@ -40,7 +40,8 @@ teach more than updates: above all what a collision looks like (docs/experiments
 critics that expect what comes one of three seeds was at 83 % without a collision, with those that fear too much all were at
 96 and more (section 18).
 """
-ASSESSMENT_UPDATES = 400
+FIT_UPDATES = 400
+"""Of the cost critics alone, when the policy stays as it is (docs/experiments.md, section 19)."""
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
 
@@ -59,7 +60,8 @@ def run_demo(
     :param folder: where to write
     :param seed: of the training
     :param timesteps: environment steps at most
-    :param minutes: of training at most; the learning rate falls to zero over what comes first
+    :param minutes: of training at most, before the cost critics are fitted; the learning rate falls to zero over what comes
+        first
     :param episodes: of the evaluation
     :param env_id: driving scenario
     :raises ValueError: if the environment is no driving scenario with an image, or the training too short for an episode
@@ -92,7 +94,7 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     :param folder: where to write
     :param seed: of the training
     :param timesteps: environment steps at most
-    :param minutes: at most
+    :param minutes: at most, before the cost critics are fitted
     :param env_id: driving scenario
     :return: the model, and a sentence about its training
     """
@@ -103,30 +105,19 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     print(f"Training ESAD-LEND on {env_id} for {timesteps} steps or {minutes:g} minutes ...", flush=True)
     start = time.monotonic()
     model.learn(timesteps, callback=[bar, Deadline(minutes)])
-    print("Learning what the policy costs ...", flush=True)
-    assess(model)
     took = (time.monotonic() - start) / 60
     model.save(folder / "esad_lend.zip")
+    if model._n_updates > 0:
+        print(f"Learning from {FIT_UPDATES} more batches what the policy costs ...", flush=True)
+        model.replay_buffer.recency = 3.0  # it is the latest policy that is meant
+        model.fit_cost_critic(FIT_UPDATES)
+        model.save(folder / "esad_lend.zip")
     history = bar.history
     plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)
     clock = "" if model.num_timesteps >= timesteps else ", ended by the clock"
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
     wanted = f"at most {model.cost_limit} cost per episode wanted"
-    return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
-
-
-def assess(model: ESADLEND) -> None:
-    """
-    Learn what the policy costs that was found, mostly from what it did lately.
-
-    While it changes, what is expected of it is too much, and that is what keeps it safe; here it becomes what really comes
-    (docs/experiments.md, section 19).
-
-    :param model: whose policy stays as it is
-    """
-    model.replay_cost_critic_coef, model.replay_lambda, model.min_cost_critic_rate = 100.0, 0.95, 1 / 3
-    model.replay_buffer.recency = 3.0
-    model.fit_cost_critic(ASSESSMENT_UPDATES)
+    return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}, then fitted the cost critics; {wanted}."
 
 
 def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:

@@ -180,7 +180,8 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     arguments = {"policy": "CnnPolicy", "policy_kwargs": TINY, "learning_starts": 30, "pretrain_steps": 1, "batch_size": 2}
     monkeypatch.setattr(demo, "load_hyperparams", lambda *_: Hyperparams(60, 2, {**arguments, "imagination_starts": 8}))
     monkeypatch.setattr(demo, "ENV_ID", SHORT)
-    monkeypatch.setattr(demo, "ASSESSMENT_UPDATES", 2)
+    monkeypatch.setattr(demo, "FIT_UPDATES", 2)
+    monkeypatch.setitem(demo.FEW_UPDATES, "learning_starts", 30)
     folder = tmp_path / "new" / "demo"
     brief = ["--timesteps", "60", "--episodes", "2"]
     assert main(["demo", "--out", str(folder), *brief, "--threads", "1", "--seed", "3"]) == 0

@@ -5,6 +5,7 @@ from typing import Any, ClassVar
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
 from stable_baselines3.common.type_aliases import GymEnv, Schedule
+from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.constrained_algorithm import ConstrainedLatentAlgorithm
@@ -159,25 +160,28 @@ class ESADLEND(ConstrainedLatentAlgorithm):
             "imagination/cost": targets.means[0].mean().item(),
         }
 
-    def fit_cost_critic(self, gradient_steps: int) -> None:
+    def fit_cost_critic(self, gradient_steps: int, learning_rate: float = 0.002, replay_lambda: float = 0.95) -> None:
         """
-        Let the cost critics alone learn what the present policy costs, as policy evaluation does between two improvements.
-
-        Nothing happens before ``learning_starts`` steps have been collected.
+        Let the cost critics alone learn from recorded windows what the present policy costs: policy evaluation without dreams.
 
         :param gradient_steps: number of updates
+        :param learning_rate: of the cost critics, until :meth:`train` sets it again
+        :param replay_lambda: mixing of n-step returns, in [0, 1]
+        :raises ValueError: if fewer than ``learning_starts`` steps have been recorded
         """
-        if not self._has_enough_steps():
-            return
-        self.policy.set_training_mode(True)
-        self._update_learning_rate(self.policy.cost_critic.optimizer)
+        steps = self.replay_buffer.size() * self.n_envs
+        require(self._has_enough_steps(), "replay_buffer.size()", steps, f"{self.learning_starts} steps or more to learn from")
+        critic, target = self.policy.cost_critic, self.policy.cost_critic_target
+        update_learning_rate(critic.optimizer, learning_rate)
         for _ in range(gradient_steps):
             samples = self._sample(self.batch_size)
             with th.no_grad(), autocast(self.device):
                 filtered = self.policy.world_model.observe(samples, th.zeros_like(samples.rewards.T, dtype=th.bool))
-                imagined = self._imagine(samples, filtered)
+                recorded = recorded_transitions(self.policy, samples, filtered)
+                targets = recorded_cost_targets(target, recorded, self.discount_of_cost, replay_lambda)
             with autocast(self.device):
-                self._update_cost_critic(imagined, recorded_transitions(self.policy, samples, filtered))
+                losses = critic.loss(recorded.grids, recorded.actions, *targets)
+                self._step("cost_critic", (recorded.event_weights * sum(losses)).mean())
 
     def _update_actor(self, imagined: Imagination) -> Logs:
         """
