@@ -117,7 +117,7 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     clock = "" if model.num_timesteps >= timesteps else ", ended by the clock"
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
     wanted = f"at most {model.cost_limit} cost per episode wanted"
-    return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}, then fitted the cost critics; {wanted}."
+    return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
 
 
 def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:
