@@ -64,6 +64,7 @@ def diffusion(steps: int) -> dict[str, Any]:
 RECORDED: dict[str, Any] = {
     "replay_cost_critic_coef": 10.0,
     "replay_lambda": 0.95,
+    "min_cost_critic_rate": 1 / 3,
     "replay_buffer_kwargs": {"recency": 3.0},
 }
 """As with the settings of hyperparams/, which the demo's budget, that of all arms that imagine, replaces."""

@@ -38,7 +38,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`LatentPolicy`
     :param env: environment with a Box action space, whose info dict holds a cost in [0, 1]
     :param learning_rate: of all networks, a number or a function of the remaining progress; 0.006 by default, which
-        falls to 0 in the second half of the training
+        falls to 0 in the second half of the training, that of the cost critics to ``min_cost_critic_rate`` of it
     :param cost_limit: undiscounted cost allowed per episode; 0 is strict, None is no limit
     :param risk_level: worst fraction of outcomes that shall keep the limit, in (0, 1]; 1 limits the mean
     :param ent_coef: weight of the entropy; a number, ``"auto"`` to learn it, or ``"auto_0.1"`` to learn it from 0.1
