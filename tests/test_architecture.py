@@ -12,9 +12,8 @@ MODULES = sorted(PACKAGE.rglob("*.py"))
 
 # From the lowest to the highest; a module may import those of its own and of lower layers.
 LAYERS = [
-    "common.type_aliases common.functional common.returns common.transforms common.torch_layers common.target_networks "
-    "common.optimizers",
-    "common.precision common.checks common.memory common.schedules common.side_by_side common.noise",
+    "common.type_aliases common.functional common.transforms common.torch_layers common.target_networks common.optimizers",
+    "common.returns common.precision common.checks common.memory common.schedules common.side_by_side common.noise",
     "common.log_keys common.warn_once common.image_watch",
     "common.plain_values common.plain_zip common.numpy_state",
     "common.costs common.six_values common.frames common.windows common.cost_buffers common.buffers",
