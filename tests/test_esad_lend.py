@@ -128,6 +128,13 @@ def test_cost_critics_learn_what_a_policy_costs_that_stays(tmp_path: Path) -> No
     assert means.mean().item() == pytest.approx(0.53, abs=0.1)
 
 
+def test_cost_critics_that_have_never_learned_make_room_for_several_costs() -> None:
+    model = make_model(cost_gamma=0.5).learn(19)
+    model.learning_starts = 10
+    model.fit_cost_critic(1)
+    assert model._n_updates == 0 and model.policy.cost_critic_target.bound.item() == 2.0
+
+
 def test_cost_critics_need_something_to_learn_from() -> None:
     with pytest.raises(ValueError, match=r"replay_buffer.size\(\) is 0; choose 20 steps or more to learn from"):
         make_model().fit_cost_critic(1)

@@ -171,15 +171,16 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         """
         steps = self.replay_buffer.size() * self.n_envs
         require(self._has_enough_steps(), "replay_buffer.size()", steps, f"{self.learning_starts} steps or more to learn from")
+        self._raise_cost_bound()
         critic, target = self.policy.cost_critic, self.policy.cost_critic_target
         update_learning_rate(critic.optimizer, learning_rate)
         for _ in range(gradient_steps):
             samples = self._sample(self.batch_size)
-            with th.no_grad(), autocast(self.device):
-                filtered = self.policy.world_model.observe(samples, th.zeros_like(samples.rewards.T, dtype=th.bool))
+            with autocast(self.device):
+                with th.no_grad():
+                    filtered = self.policy.world_model.observe(samples, th.zeros_like(samples.rewards.T, dtype=th.bool))
                 recorded = recorded_transitions(self.policy, samples, filtered)
                 targets = recorded_cost_targets(target, recorded, self.discount_of_cost, replay_lambda)
-            with autocast(self.device):
                 losses = critic.loss(recorded.grids, recorded.actions, *targets)
                 self._step("cost_critic", (recorded.event_weights * sum(losses)).mean())
 
