@@ -19,6 +19,7 @@ from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
+from variants import VARIANTS
 
 from sb3_esad import ADEND, ESADLEND, SADLEN, WCSAC, SACLag
 from sb3_esad.demo import FEW_UPDATES
@@ -93,6 +94,7 @@ ALGORITHMS: dict[str, Callable[[str, int, dict[str, Any]], OffPolicyAlgorithm]] 
     "wcsac": partial(tuned, WCSAC, "wcsac"),
     "sac_lag": partial(tuned, SACLag, "sac_lag"),
     "sac": sac,
+    **{name: partial(tuned, algorithm, "esad_lend") for name, algorithm in VARIANTS.items()},
 }
 
 

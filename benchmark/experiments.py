@@ -17,10 +17,11 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from variants import VARIANTS
 
 from sb3_esad.envs.intervals import mean_interval, wilson_interval
 
-IMAGINING = ("esad_lend", "sad_len", "ad_end")
+IMAGINING = ("esad_lend", "sad_len", "ad_end", *VARIANTS)
 HIGHWAY, BRAKING = "esad-highway-v0", "esad-braking-v0"
 SITUATIONS = (HIGHWAY, "esad-traffic-negotiation-v0", "esad-obstacle-avoidance-v0", BRAKING)
 
@@ -71,6 +72,16 @@ RECORDED: dict[str, Any] = {
 FILTER: dict[str, Any] = {"filter_start": 300}
 BARRIER: dict[str, Any] = {"barrier_coef": 1.0}
 EXPERIMENTS = {
+    "E2": Experiment(
+        "Risk with or without the bound that costs are never negative?",
+        (HIGHWAY,),
+        {"capped": Arm("esad_lend", {}), "Gaussian": Arm("gaussian_risk", {})},
+    ),
+    "E3": Experiment(
+        "What moves the multiplier?",
+        (HIGHWAY,),
+        {"both": Arm("esad_lend", {}), "critics": Arm("model_signal", {}), "road": Arm("road_signal", {})},
+    ),
     "E4": Experiment(
         "How many steps of diffusion?",
         (HIGHWAY, "esad-traffic-negotiation-v0"),

@@ -36,8 +36,13 @@ def load(path: Path | None, filter_start: int | None) -> ESADLEND:
         model = ESADLEND("CnnPolicy", env, buffer_size=1000, seed=0, filter_start=filter_start, **SIZES)
     else:
         model = ESADLEND.load(path, device="cpu", filter_start=filter_start, **SIZES)
-    if isinstance(model.policy.action_filter, SafetyFilter):
-        model.policy.action_filter.is_active = lambda: True
+    if filter_start is not None:
+        action_filter = model.policy.action_filter
+        if not isinstance(action_filter, SafetyFilter):
+            raise SystemExit(
+                f"{path} was trained with cost_limit={model.cost_limit}: choose a model with a limit, which has a filter."
+            )
+        action_filter.is_active = lambda: True
     return model
 
 

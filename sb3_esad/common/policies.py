@@ -54,6 +54,7 @@ class LatentPolicy(BasePolicy):
 
     head_class: ClassVar[type[LatentHead]] = GaussianHead
     extractor_class: ClassVar[type[BaseFeaturesExtractor]] = VectorExtractor
+    cost_critic_class: ClassVar[type[CostCritic]] = CostCritic
     action_space: spaces.Box
 
     def __init__(
@@ -104,7 +105,7 @@ class LatentPolicy(BasePolicy):
         grid = (rssm.memory_shape[0] + rssm.latent_shape[0], *rssm.memory_shape[1:])
         self.actor = Actor(grid, rssm.action_dim, self.actor_arch)
         self.critic = QEnsemble(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
-        self.cost_critic = CostCritic(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
+        self.cost_critic = self.cost_critic_class(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
         self.world_model_target, self.actor_target = make_target(self.world_model), make_target(self.actor)
         self.critic_target, self.cost_critic_target = make_target(self.critic), make_target(self.cost_critic)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # torch's stub does not know the keyword

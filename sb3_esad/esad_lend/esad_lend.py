@@ -164,7 +164,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         """
         Let the cost critics alone learn from recorded windows what the present policy costs: policy evaluation without dreams.
 
-        :param gradient_steps: number of updates
+        :param gradient_steps: number of updates; a few hundred, for with more they know the few recorded costs by heart and
+            expect too little elsewhere
         :param learning_rate: of the cost critics, until :meth:`train` sets it again
         :param replay_lambda: mixing of n-step returns, in [0, 1]
         :raises ValueError: if fewer than ``learning_starts`` steps have been recorded
