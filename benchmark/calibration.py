@@ -92,6 +92,17 @@ def figures(visits: Visits) -> tuple[float, float, float, float]:
     return visits.mean.mean(), visits.cost_to_come.mean(), predicted, visits.cost_to_come.std()
 
 
+def by_expectation(visits: Visits) -> list[Visits]:
+    """
+    Sort states by what was expected.
+
+    :param visits: states
+    :return: ``BINS`` parts of equal size, the safest first
+    """
+    parts = np.array_split(np.argsort(visits.mean), BINS)
+    return [Visits(*(column[part] for column in visits)) for part in parts]
+
+
 def plot(path: Path, bins: list[Visits]) -> None:
     """
     Draw predicted against found, for mean and standard deviation.
@@ -122,8 +133,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("calibration.png"))
     args = parser.parse_args()
     visits = drive(ESADLEND.load(args.model, device="cpu"), args.env, args.steps, args.n_envs, args.seed)
-    order = np.argsort(visits.mean)
-    bins = [Visits(*(column[chosen] for column in visits)) for chosen in np.array_split(order, BINS)]
+    bins = by_expectation(visits)
     for name, each in [("all", visits), *((str(index), each) for index, each in enumerate(bins))]:
         mean, found_mean, deviation, found_deviation = figures(each)
         means = f"mean {mean:.4f} against {found_mean:.4f}"

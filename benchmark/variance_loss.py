@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import torch as th
-from calibration import BINS, UNSEEN, Visits, drive, figures
+from calibration import UNSEEN, Visits, by_expectation, drive, figures
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.type_aliases import PyTorchObs
 
@@ -99,9 +99,7 @@ def main() -> None:
     for name, policy_class in ARMS.items():
         model = fit(policy_class, args.model, args.buffer, args.env, args.updates)
         visits = drive(model, args.env, args.steps, args.n_envs, args.seed)
-        order = np.argsort(visits.mean)
-        bins = [Visits(*(column[chosen] for column in visits)) for chosen in np.array_split(order, BINS)]
-        expected, came = np.array([risks(each, model.risk_level) for each in bins]).T
+        expected, came = np.array([risks(each, model.risk_level) for each in by_expectation(visits)]).T
         slope = (expected * came).sum() / (expected**2).sum()
         mean, found_mean, deviation, found_deviation = figures(visits)
         print(f"{name}: {len(visits.mean)} states, {np.count_nonzero(visits.cost)} costs")

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch as th
 
-from benchmark.calibration import Visits
+from benchmark.calibration import Visits, by_expectation
 from benchmark.variance_loss import WassersteinCostCritic, risks
 from benchmark.variants import GaussianCostCritic, ModelSignalPenalty, RoadSignalPenalty
 from sb3_esad.common.critics import CostCritic
@@ -55,3 +55,10 @@ def test_deviations_that_learn_from_samples_end_below_the_truth() -> None:
 def test_risk_of_what_came_is_the_mean_of_its_worst_part() -> None:
     visits = Visits(np.full(10, 0.1), np.full(10, 0.09), np.zeros(10), np.arange(10) == 3)
     assert risks(visits, risk_level=0.5) == pytest.approx((0.2, 0.2))
+
+
+def test_states_are_sorted_by_what_was_expected() -> None:
+    visits = Visits(*(np.array([5, 1, 3, 2, 4, 0, 9, 7, 8, 6]) * scale for scale in (1, 2, 3, 4)))
+    bins = by_expectation(visits)
+    assert [each.mean.item() for each in bins] == list(range(10))
+    assert [each.cost_to_come.item() for each in bins] == list(range(0, 40, 4))

@@ -164,6 +164,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         """
         Let the cost critics alone learn from recorded windows what the present policy costs: policy evaluation without dreams.
 
+        Whether the filter trusts them is still judged by what they expected before, until more steps have been made.
+
         :param gradient_steps: number of updates; a few hundred, for with more they know the few recorded costs by heart and
             expect too little elsewhere
         :param learning_rate: of the cost critics, until :meth:`train` sets it again
