@@ -154,6 +154,7 @@ def main() -> None:
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--set", type=json.loads, default={}, help="JSON of constructor arguments to replace")
+    parser.add_argument("--save-buffer", action="store_true", help="at the end, beside the model")
     parser.add_argument("--few-updates", action="store_true", help="as the demo has them, for algorithms that imagine")
     args = parser.parse_args()
     th.set_num_threads(args.threads)
@@ -162,7 +163,9 @@ def main() -> None:
     path.unlink(missing_ok=True)
     curve = LearningCurve(path, args.env, args.every, range(args.unseen, args.unseen + args.episodes))
     changes = {**(FEW_UPDATES if args.few_updates else {}), **args.set}
-    ALGORITHMS[args.algorithm](args.env, args.seed, changes).learn(args.steps, callback=curve)
+    model = ALGORITHMS[args.algorithm](args.env, args.seed, changes).learn(args.steps, callback=curve)
+    if args.save_buffer:
+        model.save_replay_buffer(path.with_suffix(".pkl"))
 
 
 if __name__ == "__main__":

@@ -80,7 +80,7 @@ EXPERIMENTS = {
     "E3": Experiment(
         "What moves the multiplier?",
         (HIGHWAY,),
-        {"both": Arm("esad_lend", {}), "critics": Arm("model_signal", {}), "road": Arm("road_signal", {})},
+        {"both": Arm("esad_lend", {}), "critics": Arm("critics_only", {}), "road": Arm("road_only", {})},
     ),
     "E4": Experiment(
         "How many steps of diffusion?",

@@ -36,13 +36,8 @@ def load(path: Path | None, filter_start: int | None) -> ESADLEND:
         model = ESADLEND("CnnPolicy", env, buffer_size=1000, seed=0, filter_start=filter_start, **SIZES)
     else:
         model = ESADLEND.load(path, device="cpu", filter_start=filter_start, **SIZES)
-    if filter_start is not None:
-        action_filter = model.policy.action_filter
-        if not isinstance(action_filter, SafetyFilter):
-            raise SystemExit(
-                f"{path} was trained with cost_limit={model.cost_limit}: choose a model with a limit, which has a filter."
-            )
-        action_filter.is_active = lambda: True
+    if isinstance(model.policy.action_filter, SafetyFilter):
+        model.policy.action_filter.is_active = lambda: True
     return model
 
 
@@ -74,6 +69,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     args = parser.parse_args()
     th.set_num_threads(1)
+    if args.model is not None and ESADLEND.load(args.model, device="cpu").cost_limit is None:
+        parser.error(f"{args.model} has no cost limit and hence no filter: choose a model that was trained with a limit")
     for name, filter_start in ARMS.items():
         warm = times(load(args.model, filter_start), args.steps)
         print(

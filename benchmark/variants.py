@@ -4,22 +4,37 @@ from typing import ClassVar
 
 import torch as th
 from stable_baselines3.common.policies import BasePolicy
+from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_esad import ESADLEND
-from sb3_esad.common.critics import CostCritic
+from sb3_esad.common.critics import MIN_VARIANCE, CostCritic
 from sb3_esad.common.functional import gaussian_cvar
 from sb3_esad.common.imagined_returns import imagined_costs, taken
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.type_aliases import Imagination, Logs
 from sb3_esad.esad_lend.policies import CnnPolicy
 
+SMALLEST_VARIANCE = 1e-6
+"""With ``MIN_VARIANCE`` the risk of a Gaussian would exceed the highway's budget of .0037 wherever a car is."""
+
 
 class GaussianCostCritic(CostCritic):
-    """Cost critic whose risk is that of a Gaussian, however improbable a cost is (arXiv 2407.06317)."""
+    """Cost critic whose risk is that of a Gaussian, bounded neither by mean / alpha nor by the largest cost."""
+
+    def raw(self, state: PyTorchObs, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
+        """
+        What the losses are taken on, with variances that may be smaller.
+
+        :param state: N states, as the readout takes them
+        :param action: their actions, of shape (N, A)
+        :return: logits of shape (n_critics, N), variance of shape (N,)
+        """
+        logits, variance = super().raw(state, action)
+        return logits, variance - MIN_VARIANCE + SMALLEST_VARIANCE
 
     def risk(self, means: th.Tensor, variance: th.Tensor, risk_level: float) -> th.Tensor:
         """
-        Conditional value at risk by the more pessimistic mean, without the bound of :func:`capped_cvar`.
+        Conditional value at risk of a Gaussian by the more pessimistic mean (arXiv 2407.06317).
 
         :param means: shape (n_critics, N)
         :param variance: shape (N,)
@@ -36,7 +51,12 @@ class GaussianRiskPolicy(CnnPolicy):
 
 
 class GaussianRisk(ESADLEND):
-    """E2: the risk of a Gaussian, for actor, multiplier and filter."""
+    """
+    E2: the risk of a Gaussian for actor and multiplier, from images.
+
+    As in :func:`rising_cvar` the variance has no gradient; without the bound the risk rises by 1 with the mean, with it by
+    1 / alpha where crashes are rare.
+    """
 
     policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {"CnnPolicy": GaussianRiskPolicy}
 
@@ -46,7 +66,7 @@ class GaussianRisk(ESADLEND):
         return gaussian_cvar(costs, variance.view_as(costs).detach(), self.risk_level)
 
 
-class OneSignal(AugmentedLagrangian):
+class SingleSignalPenalty(AugmentedLagrangian):
     """Multiplier that follows one of its two signals."""
 
     signal: ClassVar[str]
@@ -55,32 +75,32 @@ class OneSignal(AugmentedLagrangian):
         return {name: value for name, value in super()._signals(violation).items() if name == self.signal}
 
 
-class ModelSignalPenalty(OneSignal):
-    """Multiplier that follows what the critics expect."""
+class CriticsOnlyPenalty(SingleSignalPenalty):
+    """Multiplier that follows what the critics expect, as long as the road finds them calibrated; it holds still else."""
 
     signal = "violation_model"
 
 
-class RoadSignalPenalty(OneSignal):
+class RoadOnlyPenalty(SingleSignalPenalty):
     """Multiplier that follows what the road has shown."""
 
     signal = "violation_road"
 
 
-class ModelSignal(ESADLEND):
-    """E3: the critics alone move the multiplier."""
+class CriticsOnly(ESADLEND):
+    """E3: the critics alone move the multiplier, where they are calibrated."""
 
-    penalty_class = ModelSignalPenalty
+    penalty_class = CriticsOnlyPenalty
 
 
-class RoadSignal(ESADLEND):
+class RoadOnly(ESADLEND):
     """E3: the road alone moves the multiplier."""
 
-    penalty_class = RoadSignalPenalty
+    penalty_class = RoadOnlyPenalty
 
 
 VARIANTS: dict[str, type[ESADLEND]] = {
     "gaussian_risk": GaussianRisk,
-    "model_signal": ModelSignal,
-    "road_signal": RoadSignal,
+    "critics_only": CriticsOnly,
+    "road_only": RoadOnly,
 }

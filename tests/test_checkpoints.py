@@ -10,13 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+from kills import Training, endure, steps_of
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
-from benchmark.kills import Training, endure, steps_of
 from sb3_esad import ADEND, ESADLEND, SADLEN, WCSAC, SACLag
 from sb3_esad.common.callbacks import CostEvalCallback
 from sb3_esad.common.checkpoints import CHECKPOINT, RunCheckpointCallback

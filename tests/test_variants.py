@@ -1,26 +1,54 @@
-"""What experiments compare ESAD-LEND with differs in what it says, and in nothing else."""
+"""What experiments compare ESAD-LEND with differs where it says."""
+
+import math
 
 import numpy as np
 import pytest
 import torch as th
+from calibration import Visits, by_expectation
+from driving import ALGORITHMS
+from gymnasium import spaces
+from variance_loss import WassersteinCostCritic, WassersteinPolicy
+from variants import VARIANTS, CriticsOnlyPenalty, GaussianCostCritic, RoadOnlyPenalty
 
-from benchmark.calibration import Visits, by_expectation
-from benchmark.variance_loss import WassersteinCostCritic, risks
-from benchmark.variants import GaussianCostCritic, ModelSignalPenalty, RoadSignalPenalty
+from sb3_esad import ESADLEND
 from sb3_esad.common.critics import CostCritic
+from sb3_esad.common.imagined_returns import imagined_costs
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.torch_layers import GridReadout
+from tests.conftest import RandomEnv
+from tests.test_esad_lend import imagine
+
+IMAGES = RandomEnv(spaces.Box(0, 255, (3, 64, 64), np.uint8))
 
 
-@pytest.mark.parametrize(("critic_class", "risk"), [(CostCritic, 0.2), (GaussianCostCritic, 0.2596)])
-def test_the_bound_of_risk_is_what_differs(critic_class: type[CostCritic], risk: float) -> None:
-    critic = critic_class(GridReadout((4, 1, 1), 16), action_dim=1, net_arch=[16])
-    found = critic.risk(th.tensor([[0.1], [0.05]]), th.tensor([0.04]), risk_level=0.5)
-    assert found.item() == pytest.approx(risk, abs=1e-4)
+def make_critic(critic_class: type[CostCritic]) -> CostCritic:
+    th.manual_seed(0)
+    return critic_class(GridReadout((4, 1, 1), 16), action_dim=1, net_arch=[16])
 
 
 @pytest.mark.parametrize(
-    ("penalty_class", "moved"), [(AugmentedLagrangian, 0.0), (ModelSignalPenalty, 0.1), (RoadSignalPenalty, -0.1)]
+    ("critic_class", "variance", "risk"),
+    [
+        (CostCritic, 0.04, 0.2),
+        (CostCritic, 0.01, 0.1798),
+        (GaussianCostCritic, 0.04, 0.2596),
+        (GaussianCostCritic, 0.01, 0.1798),
+    ],
+)
+def test_the_bound_of_risk_is_what_differs(critic_class: type[CostCritic], variance: float, risk: float) -> None:
+    found = make_critic(critic_class).risk(th.tensor([[0.1], [0.05]]), th.tensor([variance]), risk_level=0.5)
+    assert found.item() == pytest.approx(risk, abs=1e-4)
+
+
+def test_a_gaussian_may_be_narrower() -> None:
+    critic = make_critic(GaussianCostCritic)
+    th.nn.init.constant_(critic.variance[-1].bias, -100.0)
+    assert critic(th.zeros(1, 4, 1, 1), th.zeros(1, 1))[1].item() == pytest.approx(1e-6, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    ("penalty_class", "moved"), [(AugmentedLagrangian, 0.0), (CriticsOnlyPenalty, 0.1), (RoadOnlyPenalty, -0.1)]
 )
 def test_signals_that_disagree_move_a_multiplier_that_follows_one(
     penalty_class: type[AugmentedLagrangian], moved: float
@@ -34,27 +62,46 @@ def test_signals_that_disagree_move_a_multiplier_that_follows_one(
     assert penalty.multiplier.item() - before == pytest.approx(moved, abs=1e-6)
 
 
-def test_deviations_that_learn_from_samples_end_below_the_truth() -> None:
-    """Where a squared error is 1 with a chance of .01, else 0, the variance is .01; the mean deviation squared is .0001."""
-    ends = {}
-    for critic_class in (CostCritic, WassersteinCostCritic):
-        th.manual_seed(0)
-        critic = critic_class(GridReadout((4, 1, 1), 16), action_dim=1, net_arch=[16])
-        state, action = th.zeros(100, 4, 1, 1), th.zeros(100, 1)
-        targets = (th.arange(100) == 0).float()
-        optimizer = th.optim.Adam(critic.variance.parameters(), lr=0.01)
-        for _ in range(400):
-            optimizer.zero_grad()
-            critic.loss(state, action, targets, targets)[1].mean().backward()
-            optimizer.step()
-        ends[critic_class] = critic(state, action)[1][0].item()
-    assert ends[CostCritic] == pytest.approx(0.01, abs=1e-3)
-    assert ends[WassersteinCostCritic] == pytest.approx(0.0001, abs=1e-4)
+@pytest.mark.parametrize(("critic_class", "learned"), [(CostCritic, 0.1), (WassersteinCostCritic, 0.01)])
+def test_deviations_that_learn_from_samples_end_below_the_truth(critic_class: type[CostCritic], learned: float) -> None:
+    """Where a squared error is 1 with a chance of .1, else 0, the variance is .1; the mean deviation squared is .01."""
+    critic = make_critic(critic_class)
+    state, action = th.zeros(100, 4, 1, 1), th.zeros(100, 1)
+    targets = (th.arange(100) < 10).float()
+    optimizer = th.optim.Adam(critic.variance.parameters(), lr=0.01)
+    for _ in range(400):
+        optimizer.zero_grad()
+        critic.loss(state, action, targets, targets)[1].mean().backward()
+        optimizer.step()
+    assert critic(state, action)[1][0].item() == pytest.approx(learned, rel=0.1)
 
 
-def test_risk_of_what_came_is_the_mean_of_its_worst_part() -> None:
-    visits = Visits(np.full(10, 0.1), np.full(10, 0.09), np.zeros(10), np.arange(10) == 3)
-    assert risks(visits, risk_level=0.5) == pytest.approx((0.2, 0.2))
+@pytest.mark.parametrize(
+    ("policy_class", "critic_class"), [("CnnPolicy", CostCritic), (WassersteinPolicy, WassersteinCostCritic)]
+)
+def test_a_policy_builds_its_critic_and_the_average_of_it(policy_class: str, critic_class: type[CostCritic]) -> None:
+    policy = ESADLEND(policy_class, IMAGES, buffer_size=100).policy
+    assert type(policy.cost_critic) is type(policy.cost_critic_target) is critic_class
+
+
+@pytest.mark.parametrize("name", VARIANTS)
+def test_variants_can_be_trained_by_name_and_have_their_part(name: str) -> None:
+    parts = {"gaussian_risk": GaussianCostCritic, "critics_only": CriticsOnlyPenalty, "road_only": RoadOnlyPenalty}
+    assert ALGORITHMS[name].args[0] is VARIANTS[name]
+    model = VARIANTS[name]("CnnPolicy", IMAGES, buffer_size=100)
+    assert parts[name] in {type(model.policy.cost_critic), type(model.penalty)}
+
+
+def test_the_actor_descends_the_risk_of_a_gaussian() -> None:
+    """At the variance .04 it is .798 x .2 above the expected cost, however small that is."""
+    settings = {"buffer_size": 100, "learning_starts": 20, "batch_size": 2, "sequence_length": 8}
+    model = VARIANTS["gaussian_risk"]("CnnPolicy", IMAGES, **settings).learn(20)
+    _, _, imagined = imagine(model)
+    output = model.policy.cost_critic.variance[-1]
+    th.nn.init.zeros_(output.weight)
+    th.nn.init.constant_(output.bias, math.log(math.expm1(0.04)))
+    costs = imagined_costs(model.policy.cost_critic, imagined, model.discount_of_cost, model.lambda_return)
+    th.testing.assert_close(model._imagined_risk(imagined), costs + 0.1596, atol=1e-3, rtol=0)
 
 
 def test_states_are_sorted_by_what_was_expected() -> None:
