@@ -42,7 +42,7 @@ critics that expect what comes one of three seeds was at 83 % without a collisio
 """
 FIT_UPDATES = 300
 """
-Of the cost critics alone, when the policy stays as it is; with more they know recorded costs by heart (docs/experiments.md,
+Of the cost critics alone, when the policy stays as it is; with more they come to expect too little (docs/experiments.md,
 section 20).
 """
 UNSEEN = 1_000_000

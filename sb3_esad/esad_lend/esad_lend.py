@@ -166,8 +166,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
 
         Whether the filter trusts them is still judged by what they expected before, until more steps have been made.
 
-        :param gradient_steps: number of updates; a few hundred, for with more they know the few recorded costs by heart and
-            expect too little elsewhere
+        :param gradient_steps: number of updates; with 20,000 steps of driving recorded 300 were best, and with more too little
+            was expected (docs/experiments.md, section 20)
         :param learning_rate: of the cost critics, until :meth:`train` sets it again
         :param replay_lambda: mixing of n-step returns, in [0, 1]
         :raises ValueError: if fewer than ``learning_starts`` steps have been recorded
