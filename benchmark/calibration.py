@@ -2,7 +2,9 @@
 Do the cost critics tell the truth? ``python benchmark/calibration.py MODEL.zip --out calibration.png``.
 
 The model drives unseen episodes with the actions of its policy. On every state the predicted mean and standard deviation of
-the discounted cost to come are set against what came: over all states, and drawn in bins of the predicted mean.
+the discounted cost to come are set against what came: over all states, and drawn in bins of the predicted mean. With
+``--buffer`` the critics are fitted first, as the demo does (``benchmark/driving.py esad_lend --few-updates --save-buffer``
+leaves a model and a buffer).
 """
 
 import argparse
@@ -17,6 +19,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_esad import ESADLEND
+from sb3_esad.demo import fit_cost_critic
 
 UNSEEN = 3_000_000
 BINS = 10
@@ -126,13 +129,18 @@ def main() -> None:
     """Drive, compare, draw."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path)
+    parser.add_argument("--buffer", type=Path, help="of the model: fit its critics first, which the demo has done")
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--n-envs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=UNSEEN)
     parser.add_argument("--out", type=Path, default=Path("calibration.png"))
     args = parser.parse_args()
-    visits = drive(ESADLEND.load(args.model, device="cpu"), args.env, args.steps, args.n_envs, args.seed)
+    model = ESADLEND.load(args.model, device="cpu")
+    if args.buffer is not None:
+        model.load_replay_buffer(args.buffer)
+        fit_cost_critic(model)
+    visits = drive(model, args.env, args.steps, args.n_envs, args.seed)
     bins = by_expectation(visits)
     for name, each in [("all", visits), *((str(index), each) for index, each in enumerate(bins))]:
         mean, found_mean, deviation, found_deviation = figures(each)

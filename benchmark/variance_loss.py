@@ -19,6 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_esad import ESADLEND
 from sb3_esad.common.critics import CostCritic
 from sb3_esad.common.functional import wasserstein2
+from sb3_esad.demo import fit_cost_critic
 from sb3_esad.esad_lend.policies import CnnPolicy
 
 
@@ -51,7 +52,7 @@ class WassersteinPolicy(CnnPolicy):
 ARMS: dict[str, type[CnnPolicy]] = {"squared error": CnnPolicy, "2-Wasserstein": WassersteinPolicy}
 
 
-def fit(policy_class: type[CnnPolicy], path: Path, buffer: Path, env_id: str, gradient_steps: int) -> ESADLEND:
+def fit(policy_class: type[CnnPolicy], path: Path, buffer: Path, env_id: str) -> ESADLEND:
     """
     Let a new estimate of the variance, and the means of a trained model, learn what its policy costs.
 
@@ -59,7 +60,6 @@ def fit(policy_class: type[CnnPolicy], path: Path, buffer: Path, env_id: str, gr
     :param path: of the model
     :param buffer: what it recorded
     :param env_id: scenario with images
-    :param gradient_steps: of the critics
     :return: a model with default settings, the networks of the trained one and the critic to judge
     :raises ValueError: if the model has other networks than the default ones
     """
@@ -71,8 +71,7 @@ def fit(policy_class: type[CnnPolicy], path: Path, buffer: Path, env_id: str, gr
     if unexpected or any(".variance." not in name for name in missing):
         raise ValueError(f"{path} has other networks than a default model of {env_id}: train one without policy_kwargs.")
     model.load_replay_buffer(buffer)
-    model.replay_buffer.recency = 3.0  # it is the latest policy that is meant
-    model.fit_cost_critic(gradient_steps)
+    fit_cost_critic(model)
     return model
 
 
@@ -82,13 +81,12 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("buffer", type=Path)
     parser.add_argument("--env", default="esad-highway-v0")
-    parser.add_argument("--updates", type=int, default=300)
     parser.add_argument("--steps", type=int, default=120_000)
     parser.add_argument("--n-envs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=UNSEEN)
     args = parser.parse_args()
     for name, policy_class in ARMS.items():
-        model = fit(policy_class, args.model, args.buffer, args.env, args.updates)
+        model = fit(policy_class, args.model, args.buffer, args.env)
         visits = drive(model, args.env, args.steps, args.n_envs, args.seed)
         print(f"{name}: {len(visits.mean)} states, {np.count_nonzero(visits.cost)} costs")
         for part in (visits, *by_expectation(visits)):

@@ -15,7 +15,7 @@ from sb3_esad.common.type_aliases import Imagination, Logs
 from sb3_esad.esad_lend.policies import CnnPolicy
 
 SMALLEST_VARIANCE = 1e-6
-"""With ``MIN_VARIANCE`` the risk of a Gaussian would exceed the highway's budget of .0037 wherever a car is."""
+"""With ``MIN_VARIANCE`` the risk of a Gaussian would be .008 at least, and the highway's budget is .0037."""
 
 
 class GaussianCostCritic(CostCritic):

@@ -112,8 +112,7 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     model.save(folder / "esad_lend.zip")
     if model._n_updates > 0:
         print(f"Learning from {FIT_UPDATES} more batches what the policy costs ...", flush=True)
-        model.replay_buffer.recency = 3.0  # it is the latest policy that is meant
-        model.fit_cost_critic(FIT_UPDATES)
+        fit_cost_critic(model)
         model.save(folder / "esad_lend.zip")
     history = bar.history
     plot_learning_curve(folder / "learning_curve.png", history.episodes, model.cost_limit)
@@ -121,6 +120,16 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
     wanted = f"at most {model.cost_limit} cost per episode wanted"
     return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
+
+
+def fit_cost_critic(model: ESADLEND) -> None:
+    """
+    Let the cost critics learn what a policy costs whose training is over.
+
+    :param model: with its replay buffer
+    """
+    model.replay_buffer.recency = 3.0  # it is the latest policy that is meant
+    model.fit_cost_critic(FIT_UPDATES)
 
 
 def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:
