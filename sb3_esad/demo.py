@@ -122,14 +122,15 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
 
 
-def fit_cost_critic(model: ESADLEND) -> None:
+def fit_cost_critic(model: ESADLEND, imagined_coef: float = 0.0) -> None:
     """
     Let the cost critics learn what a policy costs whose training is over.
 
     :param model: with its replay buffer
+    :param imagined_coef: weight of imagined transitions; after the demo's updates the world model would exaggerate
     """
     model.replay_buffer.recency = 3.0  # it is the latest policy that is meant
-    model.fit_cost_critic(FIT_UPDATES)
+    model.fit_cost_critic(FIT_UPDATES, imagined_coef=imagined_coef)
 
 
 def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:

@@ -70,6 +70,14 @@ def imagine(model: ESADLEND) -> tuple[SequenceSamples, Filtered, Imagination]:
     return samples, filtered, model._imagine(samples, filtered)
 
 
+def expected_cost(model: ESADLEND) -> float:
+    """Mean over recorded steps."""
+    samples, filtered, _ = imagine(model)
+    recorded = recorded_transitions(model.policy, samples, filtered)
+    means, _ = model.policy.cost_critic_target(recorded.grids, recorded.actions)
+    return means.mean().item()
+
+
 def with_gradient(model: ESADLEND) -> set[str]:
     return {
         name
@@ -122,10 +130,28 @@ def test_cost_critics_learn_what_a_policy_costs_that_stays(tmp_path: Path) -> No
     model.fit_cost_critic(200, learning_rate=0.005)
     moved = {name.split(".")[0] for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
     assert moved == {"cost_critic", "cost_critic_target"}
-    samples, filtered, _ = imagine(model)
-    recorded = recorded_transitions(model.policy, samples, filtered)
-    means, _ = model.policy.cost_critic_target(recorded.grids, recorded.actions)
-    assert means.mean().item() == pytest.approx(0.53, abs=0.1)
+    assert expected_cost(model) == pytest.approx(0.53, abs=0.1)
+
+
+@pytest.mark.parametrize(("imagined_coef", "expected"), [(0.0, 0.53), (100.0, 0.0)])
+def test_dreams_count_by_their_weight_where_cost_critics_are_fitted(imagined_coef: float, expected: float) -> None:
+    """The world model is made to dream that every episode ends at once, without a cost."""
+    model = make_model(cost_gamma=0.5).learn(40)
+    dream = model._imagine
+
+    def dream_of_safety(samples: SequenceSamples, filtered: Filtered) -> Imagination:
+        imagined = dream(samples, filtered)
+        nothing = th.zeros_like(imagined.predictions.costs)
+        return imagined._replace(predictions=imagined.predictions._replace(costs=nothing, continues=nothing))
+
+    model._imagine = dream_of_safety  # type: ignore[method-assign]
+    model.fit_cost_critic(200, learning_rate=0.005, imagined_coef=imagined_coef)
+    assert expected_cost(model) == pytest.approx(expected, abs=0.1)
+
+
+def test_the_weight_of_dreams_is_none_or_more() -> None:
+    with pytest.raises(ValueError, match=r"imagined_coef is -1\.0; choose a weight >= 0"):
+        make_model().learn(24).fit_cost_critic(1, imagined_coef=-1.0)
 
 
 def test_cost_critics_that_have_never_learned_make_room_for_several_costs() -> None:

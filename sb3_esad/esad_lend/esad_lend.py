@@ -142,50 +142,67 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         }
 
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        continue_after_cost = self._raise_cost_bound()
-        critic, target = self.policy.cost_critic, self.policy.cost_critic_target
-        targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
-        anchors = recorded_cost_targets(target, recorded, self.discount_of_cost, self.replay_lambda)
-        weights = imagined.weights.flatten()
-        mean_loss, variance_loss = critic.loss(*taken(imagined), *(each.flatten() for each in targets))
-        anchor_mean_loss, anchor_variance_loss = critic.loss(recorded.grids, recorded.actions, *anchors)
-        dreamed = [(weights * loss).mean() for loss in (mean_loss, variance_loss)]
-        anchored = [(recorded.event_weights * loss).mean() for loss in (anchor_mean_loss, anchor_variance_loss)]
-        self._step("cost_critic", sum(dreamed) + self.replay_cost_critic_coef * sum(anchored))
+        dreamed, imagined_cost = self._imagined_cost_losses(imagined)
+        anchored = self._recorded_cost_losses(recorded, self.replay_lambda)
+        self._step("cost_critic", dreamed.sum() + self.replay_cost_critic_coef * anchored.sum())
         return {
             "cost_critic_loss": dreamed[0].item(),
             "cost_var_loss": dreamed[1].item(),
             "replay_cost_critic_loss": anchored[0].item(),
             "replay_cost_var_loss": anchored[1].item(),
-            "imagination/cost": targets.means[0].mean().item(),
+            "imagination/cost": imagined_cost.item(),
         }
 
-    def fit_cost_critic(self, gradient_steps: int, learning_rate: float = 0.002, replay_lambda: float = 0.95) -> None:
+    def _imagined_cost_losses(self, imagined: Imagination) -> tuple[th.Tensor, th.Tensor]:
+        """Losses of mean and variance on imagined transitions, of shape (2,), and the mean cost that their starts lead to."""
+        continue_after_cost, target = self._raise_cost_bound(), self.policy.cost_critic_target
+        targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
+        losses = self.policy.cost_critic.loss(*taken(imagined), *(each.flatten() for each in targets))
+        return th.stack([(imagined.weights.flatten() * loss).mean() for loss in losses]), targets.means[0].mean()
+
+    def _recorded_cost_losses(self, recorded: Transitions, replay_lambda: float) -> th.Tensor:
+        """Losses of mean and variance on recorded transitions, of shape (2,)."""
+        targets = recorded_cost_targets(self.policy.cost_critic_target, recorded, self.discount_of_cost, replay_lambda)
+        losses = self.policy.cost_critic.loss(recorded.grids, recorded.actions, *targets)
+        return th.stack([(recorded.event_weights * loss).mean() for loss in losses])
+
+    def fit_cost_critic(
+        self,
+        gradient_steps: int,
+        learning_rate: float = 0.002,
+        replay_lambda: float = 0.95,
+        imagined_coef: float = 0.0,
+    ) -> None:
         """
-        Let the cost critics alone learn from recorded windows what the present policy costs: policy evaluation without dreams.
+        Let the cost critics alone learn what the present policy costs.
 
         Whether the filter trusts them is still judged by what they expected before, until more steps have been made.
 
-        :param gradient_steps: number of updates; with 20,000 steps of driving recorded 300 were best, and with more too little
-            was expected (docs/experiments.md, section 20)
+        :param gradient_steps: number of updates; with 20,000 steps of driving recorded 300 were best
+            (docs/experiments.md, sections 20 and 21)
         :param learning_rate: of the cost critics, until :meth:`train` sets it again
         :param replay_lambda: mixing of n-step returns, in [0, 1]
+        :param imagined_coef: weight of imagined transitions beside 1 of recorded ones. Recorded costs are known by heart in
+            the end, and too few are expected elsewhere; imagined ones are new each time, but too many while the world model
+            is young
         :raises ValueError: if fewer than ``learning_starts`` steps have been recorded
         """
         steps = self.replay_buffer.size() * self.n_envs
         require(self._has_enough_steps(), "replay_buffer.size()", steps, f"{self.learning_starts} steps or more to learn from")
+        require(imagined_coef >= 0, "imagined_coef", imagined_coef, "a weight >= 0")
         self._raise_cost_bound()
-        critic, target = self.policy.cost_critic, self.policy.cost_critic_target
-        update_learning_rate(critic.optimizer, learning_rate)
+        update_learning_rate(self.policy.cost_critic.optimizer, learning_rate)
         for _ in range(gradient_steps):
             samples = self._sample(self.batch_size)
             with autocast(self.device):
                 with th.no_grad():
                     filtered = self.policy.world_model.observe(samples, th.zeros_like(samples.rewards.T, dtype=th.bool))
                 recorded = recorded_transitions(self.policy, samples, filtered)
-                targets = recorded_cost_targets(target, recorded, self.discount_of_cost, replay_lambda)
-                losses = critic.loss(recorded.grids, recorded.actions, *targets)
-                self._step("cost_critic", (recorded.event_weights * sum(losses)).mean())
+                loss = self._recorded_cost_losses(recorded, replay_lambda).sum()
+                if imagined_coef > 0:
+                    dreamed, _ = self._imagined_cost_losses(self._imagine(samples, filtered).detach())
+                    loss = loss + imagined_coef * dreamed.sum()
+                self._step("cost_critic", loss)
 
     def _update_actor(self, imagined: Imagination) -> Logs:
         """
