@@ -1,0 +1,112 @@
+"""The experiments of docs/experiments.md: what each asks, where, and of which arms; ``experiments.py`` runs them."""
+
+from typing import Any, NamedTuple
+
+from variants import VARIANTS
+
+IMAGINING = ("esad_lend", "sad_len", "ad_end", *VARIANTS)
+HIGHWAY, BRAKING = "esad-highway-v0", "esad-braking-v0"
+SITUATIONS = (HIGHWAY, "esad-traffic-negotiation-v0", "esad-obstacle-avoidance-v0", BRAKING)
+
+
+class Arm(NamedTuple):
+    """
+    One side of an experiment.
+
+    :param algorithm: key of ``ALGORITHMS`` in benchmark/driving.py
+    :param changes: arguments of its constructor to replace
+    """
+
+    algorithm: str
+    changes: dict[str, Any]
+
+
+class Experiment(NamedTuple):
+    """
+    A question that trainings answer.
+
+    :param question: in words
+    :param envs: scenarios
+    :param arms: by name, the first is what the others are compared with
+    """
+
+    question: str
+    envs: tuple[str, ...]
+    arms: dict[str, Arm]
+
+
+def diffusion(steps: int) -> dict[str, Any]:
+    """
+    Set the steps of the latent's diffusion.
+
+    :param steps: K
+    :return: arguments of the constructor
+    """
+    return {"policy_kwargs": {"head_kwargs": {"diffusion_steps": steps}}}
+
+
+RECORDED: dict[str, Any] = {
+    "replay_cost_critic_coef": 10.0,
+    "replay_lambda": 0.95,
+    "min_cost_critic_rate": 1 / 3,
+    "replay_buffer_kwargs": {"recency": 3.0},
+}
+"""As with the settings of hyperparams/, which the demo's budget, that of all arms that imagine, replaces."""
+FILTER: dict[str, Any] = {"filter_start": 300}
+BARRIER: dict[str, Any] = {"barrier_coef": 1.0}
+EXPERIMENTS = {
+    "E2": Experiment(
+        "Risk with or without the bound that costs are never negative?",
+        (HIGHWAY,),
+        {"capped": Arm("esad_lend", {}), "Gaussian": Arm("gaussian_risk", {})},
+    ),
+    "E3": Experiment(
+        "What moves the multiplier?",
+        (HIGHWAY,),
+        {"both": Arm("esad_lend", {}), "critics": Arm("critics_only", {}), "road": Arm("road_only", {})},
+    ),
+    "E4": Experiment(
+        "How many steps of diffusion?",
+        (HIGHWAY, "esad-traffic-negotiation-v0"),
+        {f"K = {steps}": Arm("esad_lend", diffusion(steps)) for steps in (0, 1, 2, 3)},
+    ),
+    "E5": Experiment(
+        "Does the filter prevent collisions, and the barrier?",
+        (HIGHWAY, BRAKING),
+        {
+            "neither": Arm("esad_lend", {}),
+            "filter": Arm("esad_lend", FILTER),
+            "barrier": Arm("esad_lend", BARRIER),
+            "both": Arm("esad_lend", {**FILTER, **BARRIER}),
+        },
+    ),
+    "E6": Experiment(
+        "How much entropy?",
+        (HIGHWAY,),
+        {f"target {target}": Arm("esad_lend", {"target_entropy": target}) for target in (-2.0, -1.0, 0.0)},
+    ),
+    "E7": Experiment(
+        "Are recorded costs needed, and more of them than there were?",
+        (HIGHWAY,),
+        {
+            "both": Arm("esad_lend", {}),
+            "critics from imagination alone": Arm("esad_lend", {"replay_cost_critic_coef": 0.0}),
+            "above all recorded windows": Arm("esad_lend", RECORDED),
+            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0}}),
+        },
+    ),
+    "E9": Experiment(
+        "Ahead of algorithms without a model?",
+        (HIGHWAY, BRAKING),
+        {name: Arm(name, {}) for name in ("esad_lend", "sac", "sac_lag", "wcsac")},
+    ),
+    "ablations": Experiment(
+        "What are diffusion and safety worth?",
+        SITUATIONS,
+        {
+            "ESAD-LEND": Arm("esad_lend", {**diffusion(2), **FILTER, **BARRIER}),
+            "SAD-LEN": Arm("sad_len", {**FILTER, **BARRIER}),
+            "AD-END": Arm("ad_end", {}),
+        },
+    ),
+}
