@@ -38,7 +38,22 @@ def kernel_size(shape: GridShape) -> int:
     return 3 if shape[1] * shape[2] > 1 else 1
 
 
-def same_conv(in_channels: int, out_channels: int, kernel: int) -> nn.Conv2d:
+class GridConv(nn.Conv2d):
+    """Convolution of a grid; on one of a single cell it is a matrix product, which takes half of the time as such."""
+
+    def forward(self, grid: th.Tensor) -> th.Tensor:
+        """
+        Convolve.
+
+        :param grid: features, of shape (N, C, H, W)
+        :return: features, of shape (N, out_channels, H, W) if the kernel keeps height and width
+        """
+        if self.kernel_size == (1, 1) and grid.shape[2:] == (1, 1):
+            return nn.functional.linear(grid.flatten(1), self.weight.flatten(1), self.bias)[..., None, None]
+        return super().forward(grid)
+
+
+def same_conv(in_channels: int, out_channels: int, kernel: int) -> GridConv:
     """
     Build a convolution that keeps height and width.
 
@@ -47,7 +62,7 @@ def same_conv(in_channels: int, out_channels: int, kernel: int) -> nn.Conv2d:
     :param kernel: odd width of the kernel
     :return: the convolution
     """
-    return nn.Conv2d(in_channels, out_channels, kernel, padding=kernel // 2)
+    return GridConv(in_channels, out_channels, kernel, padding=kernel // 2)
 
 
 def conv_block(in_channels: int, out_channels: int, kernel: int) -> nn.Sequential:
