@@ -74,19 +74,21 @@ class CostInReward(gym.Wrapper[Any, Any, Any, Any]):
 
 def sac(env_id: str, seed: int, changes: dict[str, Any]) -> SAC:
     """
-    Build SB3's SAC for images that show speeds in one frame, or for vectors; settings by docs/experiments.md, section 14.
+    Build SB3's SAC for images that show speeds in one frame, as tuned in docs/experiments.md, section 14.
 
-    :param env_id: scenario
+    :param env_id: scenario; those of vectors take the settings of images
     :param seed: of the training
     :param changes: arguments of the constructor to replace, and ``penalty``, what a cost takes from the reward
     :return: the algorithm
     """
-    penalty = changes.pop("penalty", 10.0)
-    tuned = {"batch_size": 64, "learning_rate": 1e-3, "ent_coef": "auto_0.1", "target_entropy": -1.0}
-    arguments: dict[str, Any] = {"buffer_size": 50_000, "gamma": 0.97, "learning_starts": 1000, **tuned, **changes}
-    env = make_vec_env(env_id, wrapper_class=partial(CostInReward, penalty=penalty))
-    policy = "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy"
-    return SAC(policy, env, seed=seed, **arguments)
+    env = make_vec_env(env_id, wrapper_class=partial(CostInReward, penalty=changes.pop("penalty", 10.0)))
+    arguments: dict[str, Any] = {
+        "policy": "CnnPolicy" if is_image_space(env.observation_space) else "MlpPolicy",
+        **{"buffer_size": 50_000, "gamma": 0.97, "learning_starts": 1000},
+        **{"batch_size": 64, "learning_rate": 1e-3, "ent_coef": "auto_0.1", "target_entropy": -1.0},
+        **changes,
+    }
+    return SAC(env=env, seed=seed, **arguments)
 
 
 ALGORITHMS: dict[str, Callable[[str, int, dict[str, Any]], OffPolicyAlgorithm]] = {

@@ -42,8 +42,8 @@ critics that expect what comes one of three seeds was at 83 % without a collisio
 """
 FIT_UPDATES = 300
 """
-Of the cost critics alone, when the policy stays as it is; with more they come to expect too little (docs/experiments.md,
-section 20).
+Of the cost critics alone, from recorded windows, when the policy stays as it is; with more they come to expect too little
+(docs/experiments.md, section 20).
 """
 UNSEEN = 1_000_000
 """First seed of the evaluation; a training draws its episodes from its own seed and starts no episode from this one."""
@@ -122,15 +122,14 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
 
 
-def fit_cost_critic(model: ESADLEND, imagined_coef: float = 0.0) -> None:
+def fit_cost_critic(model: ESADLEND) -> None:
     """
     Let the cost critics learn what a policy costs whose training is over.
 
     :param model: with its replay buffer
-    :param imagined_coef: weight of imagined transitions; after the demo's updates the world model would exaggerate
     """
     model.replay_buffer.recency = 3.0  # it is the latest policy that is meant
-    model.fit_cost_critic(FIT_UPDATES, imagined_coef=imagined_coef)
+    model.fit_cost_critic(FIT_UPDATES)
 
 
 def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:

@@ -70,6 +70,11 @@ def imagine(model: ESADLEND) -> tuple[SequenceSamples, Filtered, Imagination]:
     return samples, filtered, model._imagine(samples, filtered)
 
 
+def moved(model: ESADLEND, before: dict[str, th.Tensor]) -> set[str]:
+    """Networks that are not as they were."""
+    return {name.split(".")[0] for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
+
+
 def expected_cost(model: ESADLEND) -> float:
     """Mean over recorded steps."""
     samples, filtered, _ = imagine(model)
@@ -128,30 +133,34 @@ def test_cost_critics_learn_what_a_policy_costs_that_stays(tmp_path: Path) -> No
     model.load_replay_buffer(tmp_path / "buffer.pkl")
     before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     model.fit_cost_critic(200, learning_rate=0.005)
-    moved = {name.split(".")[0] for name, value in model.policy.state_dict().items() if not th.equal(value, before[name])}
-    assert moved == {"cost_critic", "cost_critic_target"}
+    assert moved(model, before) == {"cost_critic", "cost_critic_target"}
     assert expected_cost(model) == pytest.approx(0.53, abs=0.1)
 
 
-@pytest.mark.parametrize(("imagined_coef", "expected"), [(0.0, 0.53), (100.0, 0.0)])
-def test_dreams_count_by_their_weight_where_cost_critics_are_fitted(imagined_coef: float, expected: float) -> None:
-    """The world model is made to dream that every episode ends at once, without a cost."""
+@pytest.mark.parametrize(("imagined_coef", "expected"), [(1.0, 0.27), (100.0, 0.0)])
+def test_imagined_costs_count_by_their_weight_where_critics_are_fitted(
+    monkeypatch: pytest.MonkeyPatch, imagined_coef: float, expected: float
+) -> None:
+    """The world model imagines that every episode ends at once, without a cost; recorded are .53, as above."""
     model = make_model(cost_gamma=0.5).learn(40)
-    dream = model._imagine
+    imagine_costs = model._imagine
 
-    def dream_of_safety(samples: SequenceSamples, filtered: Filtered) -> Imagination:
-        imagined = dream(samples, filtered)
+    def imagine_safety(samples: SequenceSamples, filtered: Filtered) -> Imagination:
+        imagined = imagine_costs(samples, filtered)
         nothing = th.zeros_like(imagined.predictions.costs)
         return imagined._replace(predictions=imagined.predictions._replace(costs=nothing, continues=nothing))
 
-    model._imagine = dream_of_safety  # type: ignore[method-assign]
+    monkeypatch.setattr(model, "_imagine", imagine_safety)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
     model.fit_cost_critic(200, learning_rate=0.005, imagined_coef=imagined_coef)
+    assert moved(model, before) == {"cost_critic", "cost_critic_target"}
     assert expected_cost(model) == pytest.approx(expected, abs=0.1)
 
 
-def test_the_weight_of_dreams_is_none_or_more() -> None:
-    with pytest.raises(ValueError, match=r"imagined_coef is -1\.0; choose a weight >= 0"):
-        make_model().learn(24).fit_cost_critic(1, imagined_coef=-1.0)
+@pytest.mark.parametrize(("name", "value"), [("imagined_coef", -1.0), ("replay_lambda", 1.5)])
+def test_fitting_needs_arguments_in_their_range(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=f"{name} is {value}; choose"):
+        make_model().fit_cost_critic(1, **{name: value})
 
 
 def test_cost_critics_that_have_never_learned_make_room_for_several_costs() -> None:

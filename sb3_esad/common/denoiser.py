@@ -3,7 +3,7 @@
 import torch as th
 from torch import nn
 
-from sb3_esad.common.torch_layers import ChannelNorm, GridShape, conv_block, dense_block, kernel_size, same_conv
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, SameConv2d, conv_block, dense_block, kernel_size
 
 
 class ResidualBlock(nn.Module):
@@ -16,7 +16,7 @@ class ResidualBlock(nn.Module):
     def __init__(self, channels: int) -> None:
         super().__init__()
         self.net = nn.Sequential(
-            ChannelNorm(channels), same_conv(channels, channels, 1), nn.SiLU(), same_conv(channels, channels, 1)
+            ChannelNorm(channels), SameConv2d(channels, channels, 1), nn.SiLU(), SameConv2d(channels, channels, 1)
         )
 
     def forward(self, grid: th.Tensor) -> th.Tensor:
@@ -43,11 +43,11 @@ class Denoiser(nn.Module):
         super().__init__()
         kernel = kernel_size(memory_shape)
         self.memory_net = conv_block(memory_shape[0], channels, kernel)
-        self.embedding_net = same_conv(embedding_channels, channels, 1)
+        self.embedding_net = SameConv2d(embedding_channels, channels, 1)
         self.level_net = dense_block(1, channels)
-        self.latent_net = same_conv(latent_channels, channels, kernel)
+        self.latent_net = SameConv2d(latent_channels, channels, kernel)
         self.blocks = nn.Sequential(ResidualBlock(channels), ChannelNorm(channels), nn.SiLU())
-        self.output = same_conv(channels, latent_channels, 1)
+        self.output = SameConv2d(channels, latent_channels, 1)
         for parameter in self.output.parameters():
             nn.init.zeros_(parameter)
 

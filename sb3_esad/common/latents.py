@@ -6,7 +6,7 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
-from sb3_esad.common.torch_layers import ChannelNorm, GridShape, conv_block, kernel_size, same_conv
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, SameConv2d, conv_block, kernel_size
 from sb3_esad.common.type_aliases import Logs
 
 MIN_STD = 0.1
@@ -152,13 +152,13 @@ class GaussianHead(LatentHead):
         kernel = kernel_size(memory_shape)
         self.scales = (dynamics_scale, representation_scale)
         self.free_nats = free_nats
-        self.embedding_net = same_conv(embedding_channels, hidden_channels, 1)
-        self.memory_net = same_conv(memory_shape[0], hidden_channels, kernel)
+        self.embedding_net = SameConv2d(embedding_channels, hidden_channels, 1)
+        self.memory_net = SameConv2d(memory_shape[0], hidden_channels, kernel)
         self.prior_net = nn.Sequential(
-            conv_block(memory_shape[0], hidden_channels, kernel), same_conv(hidden_channels, 2 * latent_channels, 1)
+            conv_block(memory_shape[0], hidden_channels, kernel), SameConv2d(hidden_channels, 2 * latent_channels, 1)
         )
         self.posterior_net = nn.Sequential(
-            ChannelNorm(hidden_channels), nn.SiLU(), same_conv(hidden_channels, 2 * latent_channels, 1)
+            ChannelNorm(hidden_channels), nn.SiLU(), SameConv2d(hidden_channels, 2 * latent_channels, 1)
         )
 
     def prior(self, memory: th.Tensor) -> Gaussian:

@@ -6,7 +6,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.latents import Gaussian, LatentHead
-from sb3_esad.common.torch_layers import ChannelNorm, GridShape, dense_block, join, kernel_size, same_conv
+from sb3_esad.common.torch_layers import ChannelNorm, GridShape, SameConv2d, dense_block, join, kernel_size
 from sb3_esad.common.type_aliases import LatentState
 
 Record = TypeVar("Record", LatentState, Gaussian)
@@ -28,11 +28,11 @@ class GridGRU(nn.Module):
         super().__init__()
         channels = memory_shape[0]
         hidden = 2 * channels
-        self.local = same_conv(channels + input_channels, hidden, kernel_size(memory_shape))
+        self.local = SameConv2d(channels + input_channels, hidden, kernel_size(memory_shape))
         self.embed_action = dense_block(action_dim, hidden)
         self.everywhere = nn.Linear(channels + hidden, hidden)
         self.norm = ChannelNorm(hidden)
-        self.gates = nn.Sequential(same_conv(hidden, 3 * channels, 1), ChannelNorm(3 * channels))
+        self.gates = nn.Sequential(SameConv2d(hidden, 3 * channels, 1), ChannelNorm(3 * channels))
 
     def forward(self, memory: th.Tensor, inputs: th.Tensor, action: th.Tensor) -> th.Tensor:
         """

@@ -38,31 +38,29 @@ def kernel_size(shape: GridShape) -> int:
     return 3 if shape[1] * shape[2] > 1 else 1
 
 
-class GridConv(nn.Conv2d):
-    """Convolution of a grid; on one of a single cell it is a matrix product, which takes half of the time as such."""
+class SameConv2d(nn.Conv2d):
+    """
+    Convolution that keeps height and width.
+
+    :param in_channels: channels of the input
+    :param out_channels: channels of the output
+    :param kernel: odd width of the kernel
+    """
+
+    def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
+        super().__init__(in_channels, out_channels, kernel, padding=kernel // 2)
 
     def forward(self, grid: th.Tensor) -> th.Tensor:
         """
         Convolve.
 
-        :param grid: features, of shape (N, C, H, W)
-        :return: features, of shape (N, out_channels, H, W) if the kernel keeps height and width
+        :param grid: features, of shape (N, in_channels, H, W)
+        :return: features, of shape (N, out_channels, H, W)
         """
         if self.kernel_size == (1, 1) and grid.shape[2:] == (1, 1):
+            # The memory of a vector is one cell, and a matrix product is faster than a convolution of it
             return nn.functional.linear(grid.flatten(1), self.weight.flatten(1), self.bias)[..., None, None]
         return super().forward(grid)
-
-
-def same_conv(in_channels: int, out_channels: int, kernel: int) -> GridConv:
-    """
-    Build a convolution that keeps height and width.
-
-    :param in_channels: channels of the input
-    :param out_channels: channels of the output
-    :param kernel: odd width of the kernel
-    :return: the convolution
-    """
-    return GridConv(in_channels, out_channels, kernel, padding=kernel // 2)
 
 
 def conv_block(in_channels: int, out_channels: int, kernel: int) -> nn.Sequential:
@@ -74,7 +72,7 @@ def conv_block(in_channels: int, out_channels: int, kernel: int) -> nn.Sequentia
     :param kernel: odd width of the kernel
     :return: the block
     """
-    return nn.Sequential(same_conv(in_channels, out_channels, kernel), ChannelNorm(out_channels), nn.SiLU())
+    return nn.Sequential(SameConv2d(in_channels, out_channels, kernel), ChannelNorm(out_channels), nn.SiLU())
 
 
 def dense_block(input_dim: int, units: int) -> nn.Sequential:
@@ -129,7 +127,7 @@ class GridReadout(Readout):
         channels, height, width = shape
         cell_features = max(1, min(channels, flat_features // (height * width)))
         self.features_dim = features_dim
-        self.cells = nn.Sequential(same_conv(channels, cell_features, 1), nn.SiLU())
+        self.cells = nn.Sequential(SameConv2d(channels, cell_features, 1), nn.SiLU())
         self.mix = nn.Sequential(
             nn.Flatten(), nn.Linear(cell_features * height * width, features_dim), nn.LayerNorm(features_dim), nn.SiLU()
         )

@@ -9,6 +9,7 @@ from stable_baselines3.common.utils import update_learning_rate
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.constrained_algorithm import ConstrainedLatentAlgorithm
+from sb3_esad.common.critics import CostTargets
 from sb3_esad.common.entropy import make_entropy_coefficient
 from sb3_esad.common.functional import rising_cvar
 from sb3_esad.common.imagined_returns import imagined_costs, imagined_returns, taken
@@ -142,7 +143,8 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         }
 
     def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
-        dreamed, imagined_cost = self._imagined_cost_losses(imagined)
+        targets = self._imagined_cost_targets(imagined, self._raise_cost_bound())
+        dreamed = self._imagined_cost_losses(imagined, targets)
         anchored = self._recorded_cost_losses(recorded, self.replay_lambda)
         self._step("cost_critic", dreamed.sum() + self.replay_cost_critic_coef * anchored.sum())
         return {
@@ -150,21 +152,24 @@ class ESADLEND(ConstrainedLatentAlgorithm):
             "cost_var_loss": dreamed[1].item(),
             "replay_cost_critic_loss": anchored[0].item(),
             "replay_cost_var_loss": anchored[1].item(),
-            "imagination/cost": imagined_cost.item(),
+            "imagination/cost": targets.means[0].mean().item(),
         }
 
-    def _imagined_cost_losses(self, imagined: Imagination) -> tuple[th.Tensor, th.Tensor]:
-        """Losses of mean and variance on imagined transitions, of shape (2,), and the mean cost that their starts lead to."""
-        continue_after_cost, target = self._raise_cost_bound(), self.policy.cost_critic_target
-        targets = cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
-        losses = self.policy.cost_critic.loss(*taken(imagined), *(each.flatten() for each in targets))
-        return th.stack([(imagined.weights.flatten() * loss).mean() for loss in losses]), targets.means[0].mean()
+    def _imagined_cost_targets(self, imagined: Imagination, continue_after_cost: float) -> CostTargets:
+        target = self.policy.cost_critic_target
+        return cost_targets(target, imagined, self.discount_of_cost, self.lambda_return, continue_after_cost)
+
+    def _imagined_cost_losses(self, imagined: Imagination, targets: CostTargets) -> th.Tensor:
+        return self._cost_losses(*taken(imagined), targets, imagined.weights.flatten())
 
     def _recorded_cost_losses(self, recorded: Transitions, replay_lambda: float) -> th.Tensor:
-        """Losses of mean and variance on recorded transitions, of shape (2,)."""
         targets = recorded_cost_targets(self.policy.cost_critic_target, recorded, self.discount_of_cost, replay_lambda)
-        losses = self.policy.cost_critic.loss(recorded.grids, recorded.actions, *targets)
-        return th.stack([(recorded.event_weights * loss).mean() for loss in losses])
+        return self._cost_losses(recorded.grids, recorded.actions, targets, recorded.event_weights)
+
+    def _cost_losses(self, grids: th.Tensor, actions: th.Tensor, targets: CostTargets, weights: th.Tensor) -> th.Tensor:
+        """Weighted losses of mean and variance, of shape (2,)."""
+        losses = self.policy.cost_critic.loss(grids, actions, *(each.flatten() for each in targets))
+        return th.stack([(weights * loss).mean() for loss in losses])
 
     def fit_cost_critic(
         self,
@@ -178,19 +183,20 @@ class ESADLEND(ConstrainedLatentAlgorithm):
 
         Whether the filter trusts them is still judged by what they expected before, until more steps have been made.
 
-        :param gradient_steps: number of updates; with 20,000 steps of driving recorded 300 were best
-            (docs/experiments.md, sections 20 and 21)
+        :param gradient_steps: number of updates, about 300; with more, recorded costs are overfitted and too little is
+            expected of what is new, or, with imagined ones, too much (docs/experiments.md, sections 20 and 21)
         :param learning_rate: of the cost critics, until :meth:`train` sets it again
         :param replay_lambda: mixing of n-step returns, in [0, 1]
-        :param imagined_coef: weight of imagined transitions beside 1 of recorded ones. Recorded costs are known by heart in
-            the end, and too few are expected elsewhere; imagined ones are new each time, but too many while the world model
-            is young
-        :raises ValueError: if fewer than ``learning_starts`` steps have been recorded
+        :param imagined_coef: weight of imagined transitions beside 1 of recorded ones, the inverse of
+            ``replay_cost_critic_coef``, so that 0 leaves them out: a world model exaggerates costs after a thousand updates,
+            after thousands 0.33 was best on the highway
+        :raises ValueError: if an argument is out of its range, or fewer than ``learning_starts`` steps have been recorded
         """
+        require(0 <= replay_lambda <= 1, "replay_lambda", replay_lambda, "a number in [0, 1]")
+        require(imagined_coef >= 0, "imagined_coef", imagined_coef, "a weight >= 0")
         steps = self.replay_buffer.size() * self.n_envs
         require(self._has_enough_steps(), "replay_buffer.size()", steps, f"{self.learning_starts} steps or more to learn from")
-        require(imagined_coef >= 0, "imagined_coef", imagined_coef, "a weight >= 0")
-        self._raise_cost_bound()
+        continue_after_cost = self._raise_cost_bound()
         update_learning_rate(self.policy.cost_critic.optimizer, learning_rate)
         for _ in range(gradient_steps):
             samples = self._sample(self.batch_size)
@@ -200,8 +206,10 @@ class ESADLEND(ConstrainedLatentAlgorithm):
                 recorded = recorded_transitions(self.policy, samples, filtered)
                 loss = self._recorded_cost_losses(recorded, replay_lambda).sum()
                 if imagined_coef > 0:
-                    dreamed, _ = self._imagined_cost_losses(self._imagine(samples, filtered).detach())
-                    loss = loss + imagined_coef * dreamed.sum()
+                    with th.no_grad():
+                        imagined = self._imagine(samples, filtered)
+                    targets = self._imagined_cost_targets(imagined, continue_after_cost)
+                    loss = loss + imagined_coef * self._imagined_cost_losses(imagined, targets).sum()
                 self._step("cost_critic", loss)
 
     def _update_actor(self, imagined: Imagination) -> Logs:
