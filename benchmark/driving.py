@@ -119,9 +119,12 @@ class LearningCurve(BaseCallback):
     def _on_training_start(self) -> None:
         self._next, self._seconds, self._resumed = self.every, 0.0, time.monotonic()
         self._cost, self._episodes = 0.0, 0
+        self._cost_steps: list[int] = []
 
     def _on_step(self) -> bool:
-        self._cost += sum(info["cost"] for info in self.locals["infos"])
+        costs = [info["cost"] for info in self.locals["infos"] if info["cost"] > 0]
+        self._cost += sum(costs)
+        self._cost_steps += [self.num_timesteps] * len(costs)
         self._episodes += int(self.locals["dones"].sum())
         is_last = self.num_timesteps >= self.locals["total_timesteps"]  # the updates that follow belong to the last evaluation
         if self.num_timesteps >= self._next and not is_last:
@@ -135,7 +138,7 @@ class LearningCurve(BaseCallback):
     def _evaluate(self) -> None:
         self._seconds += time.monotonic() - self._resumed
         line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
-        line |= {"training_cost": self._cost, "training_episodes": self._episodes}
+        line |= {"training_cost": self._cost, "training_episodes": self._episodes, "cost_steps": self._cost_steps}
         for name, deterministic in (("best", True), ("sampled", False)):
             line[name] = summarise(evaluate_model(self.model, self.env_id, self.seeds, deterministic))
         with self.path.open("a") as file:

@@ -3,7 +3,8 @@ The experiments of docs/experiments.md by name: ``python benchmark/experiments.p
 
 Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept.
 Those that imagine have the demo's budget: 20,000 steps, about a thousand updates. The table pools the last evaluation of all
-seeds: driving score with the interval over seeds, the rest over episodes.
+seeds: driving score with the interval over seeds, the rest over episodes. Costs in training are counted for each seed, and
+again from the step on at which all arms have begun to learn.
 """
 
 import argparse
@@ -20,6 +21,8 @@ import numpy as np
 from arms import EXPERIMENTS, IMAGINING, Arm
 
 from sb3_esad.envs.intervals import mean_interval, wilson_interval
+
+PRACTISED = 4_000
 
 
 class Run(NamedTuple):
@@ -100,7 +103,8 @@ def row(name: str, ends: list[dict[str, Any]]) -> str:
             f"{scores.mean():.1f} [{low:.1f}, {high:.1f}], {100 * free / n:.0f} [{safe[0]:.0f}, {safe[1]:.0f}], {speed:.1f}"
         )
     nearness = np.mean([end["best"]["TTC_5"] for end in ends])
-    costs = ", ".join(f"{end['training_cost']:.0f}" for end in ends)
+    later = [sum(step > PRACTISED for step in end["cost_steps"]) for end in ends]
+    costs = ", ".join(f"{len(end['cost_steps'])} ({n})" for end, n in zip(ends, later, strict=True))
     return f"| {name} | {' | '.join(cells)} | {nearness:.2f} | {costs} |"
 
 
@@ -110,7 +114,7 @@ def print_table(every: list[Run]) -> None:
 
     :param every: trainings of an experiment
     """
-    print("| scenario, arm | best: DS, collision-free %, m/s | sampled | best: TTC_5 [s] | training costs |")
+    print("| scenario, arm | best: DS, collision-free %, m/s | sampled | best: TTC_5 [s] | costs in training |")
     print("|---|---|---|---|---|")
     ends: dict[str, list[dict[str, Any]]] = {}
     for run in every:

@@ -37,15 +37,16 @@ def test_what_does_not_apply_is_told() -> None:
 
 
 @pytest.mark.parametrize(("total", "steps"), [(20, [8, 16, 20]), (16, [8, 16])])
-def test_a_learning_curve_has_one_point_at_the_end(
+def test_a_learning_curve_has_one_point_at_the_end_and_all_costs(
     total: int, steps: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(driving, "evaluate_model", lambda *args: [])
     monkeypatch.setattr(driving, "summarise", lambda records: {})
     curve = driving.LearningCurve(tmp_path / "curve.jsonl", "CountingEnv", every=8, seeds=range(1))
     SAC("MlpPolicy", CountingEnv(), learning_starts=100, buffer_size=100, train_freq=4).learn(total, callback=curve)
-    lines = (tmp_path / "curve.jsonl").read_text().splitlines()
-    assert [json.loads(line)["steps"] for line in lines] == steps
+    lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
+    assert [line["steps"] for line in lines] == steps
+    assert lines[-1]["cost_steps"] == [step for step in (3, 6, 10, 13, 17, 20) if step <= total]
 
 
 def names_one_of(row: str, pattern: str) -> bool:
