@@ -37,7 +37,7 @@ class Known(Foresight):
         return (action - self.calm).square()
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
-        return self.at(actions[:, 0])
+        return self.at(actions[:, 0]) * grids[:, 0, 0, 0]
 
 
 @pytest.fixture
@@ -100,9 +100,10 @@ def test_where_nothing_is_admissible_the_least_risk_is_taken(agent: LatentAgent)
 def test_an_action_is_as_risky_as_in_its_worst_scenarios(agent: LatentAgent, risk_level: float, expected: float) -> None:
     safety = SafetyFilter(AugmentedLagrangian(0.05), lambda: True, Known(0.0), risk_level, n_candidates=4)
     state = agent.world_model.initial(2).map(lambda field: field.expand(4, *field.shape))
-    vague = th.tensor([3.0, 1.0, 4.0, 2.0]).view(4, 1, 1, 1, 1)
-    outlook = safety.assess(agent, state._replace(memory=state.memory + vague), th.ones(3, 2, 1))
-    th.testing.assert_close(outlook.risks, th.full((3, 2), expected))
+    vague = th.tensor([[3.0, 1.0, 4.0, 2.0], [10.0, 20.0, 30.0, 40.0]]).T
+    scenarios = safety.worst(agent, state._replace(memory=state.memory + vague[..., None, None, None]), th.ones(2, 1))
+    outlook = safety.assess(agent, scenarios, th.ones(3, 2, 1))
+    th.testing.assert_close(outlook.risks, th.tensor([expected, 10 * expected]).expand(3, 2))
 
 
 @pytest.mark.parametrize("passive", [NoFilter(), make_filter(calm=5.0, active=False)])

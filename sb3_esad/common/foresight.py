@@ -55,12 +55,14 @@ class Foresight:
         """
         imagined = agent.world_model.imagine(start, lambda grid: agent.actor(grid, deterministic=True), self.steps, self.gamma)
         rewards, costs, continues = imagined.predictions
-        end = imagined.grids[-1], imagined.actions[-1]
-        end_costs, end_variance = agent.cost_critic(*end)
-        values = _sum_up(rewards, continues, agent.critic(*end).min(0).values, self.gamma)
-        means = _sum_up(costs, continues, end_costs.max(0).values, self.cost_gamma)
-        _, variance = agent.cost_critic(imagined.grids[0], imagined.actions[0])
-        risks = agent.cost_critic.risk(means[None], variance, self.risk_level)
+        ends = imagined.grids[-1], imagined.actions[-1]
+        # Beginning and end at once: for so few states it is the number of calls that takes time
+        begin_and_end = imagined.grids[[0, -1]].flatten(0, 1), imagined.actions[[0, -1]].flatten(0, 1)
+        means, variances = agent.cost_critic(*begin_and_end)
+        end_costs, (variance, end_variance) = means.chunk(2, 1)[1], variances.chunk(2)
+        values = _sum_up(rewards, continues, agent.critic(*ends).min(0).values, self.gamma)
+        costs = _sum_up(costs, continues, end_costs.max(0).values, self.cost_gamma)
+        risks = agent.cost_critic.risk(costs[None], variance, self.risk_level)
         return Outlook(values, risks, agent.cost_critic.risk(end_costs, end_variance, self.risk_level))
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -10,7 +10,6 @@ import torch as th
 from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.foresight import Foresight, Outlook
 from sb3_esad.common.penalties import Penalty
-from sb3_esad.common.precision import autocast
 from sb3_esad.common.type_aliases import Belief, LatentState, Logs
 
 CALMEST = 2
@@ -117,14 +116,15 @@ class SafetyFilter(ActionFilter):
     """
     Replaces an action that is not admissible by the most promising one that is, or else by the least risky one.
 
-    Latents drawn from P(z | h, o) are scenarios: an action is as risky as in the worst of them. To choose among latents, as in
-    figure 3 of arXiv 2407.06317, would be to choose the world in which there is no car.
+    Latents drawn from P(z | h, o) are scenarios: an action is as risky as in the worst of them, and only those that critics
+    fear most are imagined. To choose among latents, as in figure 3 of arXiv 2407.06317, would be to choose the world in which
+    there is no car.
 
     :param penalty: tells what is admissible
     :param is_active: whether the critics may be trusted with that
     :param foresight: imagines where an action leads
     :param risk_level: fraction of the worst scenarios that counts
-    :param n_candidates: scenarios
+    :param n_candidates: scenarios of which the critics choose the worst
     :param n_proposals: samples of the actor, and as many uniform actions, that the critics sift where the actor's own action
         is not admissible
     """
@@ -149,21 +149,36 @@ class SafetyFilter(ActionFilter):
     def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
         if not self.is_active():
             return NoFilter().select(agent, belief, proposed)
-        with autocast(proposed.device):
-            scenarios = draw_scenarios(agent, belief, self.n_candidates)
-            own = self.assess(agent, scenarios, proposed[None])
-            doubtful = ~self._admissible(own)[0]
-            actions, helpless = proposed.clone(), th.zeros_like(doubtful)
-            if doubtful.any():
-                chosen = scenarios.map(lambda field: field[:, doubtful])
-                state = belief.state.map(lambda field: field[doubtful])
-                known = Outlook(*(field[:, doubtful] for field in own))
-                actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful], known)
+        # In full precision, for the few states of a decision take longer to be converted than to be computed
+        scenarios = self.worst(agent, draw_scenarios(agent, belief, self.n_candidates), proposed)
+        own = self.assess(agent, scenarios, proposed[None])
+        doubtful = ~self._admissible(own)[0]
+        actions, helpless = proposed.clone(), th.zeros_like(doubtful)
+        if doubtful.any():
+            chosen = scenarios.map(lambda field: field[:, doubtful])
+            state = belief.state.map(lambda field: field[doubtful])
+            known = Outlook(*(field[:, doubtful] for field in own))
+            actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful], known)
         return Selection(actions, (actions != proposed).any(1), helpless)
+
+    def worst(self, agent: LatentAgent, scenarios: LatentState, proposed: th.Tensor) -> LatentState:
+        """
+        Choose the scenarios that count: those in which the critics fear an action most.
+
+        :param agent: whose critics judge
+        :param scenarios: fields of shape (M, N, ...)
+        :param proposed: the actions, of shape (N, A)
+        :return: the worst fraction ``risk_level`` of the scenarios, at least one
+        """
+        n_scenarios, n_states = scenarios.memory.shape[:2]
+        grids = agent.world_model.features(scenarios.map(lambda field: field.flatten(0, 1)))
+        risks = self.foresight.risk(agent, grids, proposed.repeat(n_scenarios, 1)).view(n_scenarios, n_states)
+        worst = risks.topk(math.ceil(self.risk_level * n_scenarios), dim=0).indices
+        return scenarios.map(lambda field: field[worst, th.arange(n_states, device=field.device)])
 
     def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> Outlook:
         """
-        Foresee where actions lead, on average over the scenarios as to the return, in the worst of them as to the risk.
+        Foresee where actions lead, on average over the scenarios.
 
         :param agent: whose world model and critics judge
         :param scenarios: fields of shape (M, N, ...)
@@ -175,10 +190,7 @@ class SafetyFilter(ActionFilter):
         states = scenarios.map(lambda field: field.repeat(n_proposals, *[1] * (field.dim() - 1)).flatten(0, 1))
         actions = proposals.repeat_interleave(n_scenarios, 0).flatten(0, 1)
         outlook = self.foresight(agent, states._replace(action=actions))
-        values, risks, next_risks = (field.view(n_proposals, n_scenarios, n_states) for field in outlook)
-        n_worst = math.ceil(self.risk_level * n_scenarios)
-        worst, following = (each.topk(n_worst, dim=1).values.mean(1) for each in (risks, next_risks))
-        return Outlook(values.mean(1), worst, following)
+        return Outlook(*(field.view(n_proposals, n_scenarios, n_states).mean(1) for field in outlook))
 
     def _admissible(self, outlook: Outlook) -> th.Tensor:
         return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget))
