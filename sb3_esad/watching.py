@@ -72,7 +72,7 @@ class WatchCallback(BaseCallback):
 
     def _show_films(self, model: LatentAlgorithm) -> None:
         world_model = model.policy.average.world_model
-        if not world_model.image_keys:
+        if not world_model.preprocessing.image_keys:
             return
         episode = model.replay_buffer.latest_episode(self.length, env=model._vec_normalize_env)
         if episode is None:
@@ -80,7 +80,7 @@ class WatchCallback(BaseCallback):
         before, after, actions = episode
         seen = preprocess_obs(_append(before, after), model.observation_space, model.policy.normalize_images)
         imagined = imagine_episode(model.policy, before, after, actions, self.looks)
-        for key, real in world_model.images(seen).items():
+        for key, real in world_model.preprocessing.images(seen).items():
             film = side_by_side(real, imagined[key], self.looks)
             for output in self._outputs:
                 write_film(output, f"imagination/film_{key}", film, self.num_timesteps)

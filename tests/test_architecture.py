@@ -19,6 +19,7 @@ LAYERS = [
     "common.costs common.six_values common.frames common.windows common.cost_buffers common.buffers",
     "common.recent_sums",
     "common.episode_record common.penalties common.multipliers common.entropy",
+    "common.running_scale common.preprocessing",
     "common.latents common.denoiser common.extractors common.decoders common.heads common.actor",
     "common.rssm common.diffusion",
     "common.world_model common.critics common.starts",

@@ -1,6 +1,7 @@
 """ESAD-LEND: each update moves one network only, what is executed is what is remembered, costs are kept account of."""
 
 import inspect
+from copy import deepcopy
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -355,12 +356,14 @@ def test_actor_finds_the_best_of_known_values(settings: dict[str, Any], best: fl
 
 def actor_gradient(model: ESADLEND) -> tuple[float, th.Tensor]:
     """Loss of the actor and its gradient, always on the same dreams of the same noise; the policy stays as it is."""
-    saved = {name: value.clone() for name, value in model.policy.actor.state_dict().items()}
+    networks = (model.policy.actor, model.policy.world_model)
+    saved = [deepcopy(network.state_dict()) for network in networks]
     np.random.seed(0)
     th.manual_seed(0)
     _, _, imagined = imagine(model)
     loss = model._update_actor(imagined)["actor_loss"]
-    model.policy.actor.load_state_dict(saved)
+    for network, state in zip(networks, saved, strict=True):
+        network.load_state_dict(state)
     gradients = [parameter.grad for parameter in model.policy.actor.parameters()]
     return loss, th.cat([gradient.flatten() for gradient in gradients if gradient is not None])
 

@@ -294,7 +294,7 @@ def test_targets_belong_to_the_state_arrived_at(monkeypatch: pytest.MonkeyPatch,
     samples = buffer.sample(16)._replace(event_weights=th.arange(16.0))
     model.loss(samples)
     ((grid, targets, weights),) = caught
-    count = grid[:, 1, 0, 0].round()
+    count = model.preprocessing.scales["observation"].invert(grid[:, 1, 0]).squeeze(1).round()
     th.testing.assert_close(targets.rewards, count)
     th.testing.assert_close(targets.costs, (count % 3 == 0).float())
     th.testing.assert_close(targets.continues, (count < 7).float())
@@ -472,7 +472,7 @@ def test_dictionaries_are_reconstructed_by_key() -> None:
     policy = make_policy(DICT)
     shapes = {key: tuple(view.shape) for key, view in policy.world_model.reconstruct(policy.initial_state(2)).items()}
     assert shapes == {"front": (2, 3, 32, 40), "back": (2, 1, 20, 17), "speed": (2, 3), "gear": (2, 4), "lights": (2, 2)}
-    assert set(policy.world_model.images(DICT.sample())) == {"front", "back"}
+    assert set(policy.world_model.preprocessing.images(DICT.sample())) == {"front", "back"}
 
 
 def test_vectors_have_a_single_cell() -> None:
@@ -514,7 +514,7 @@ def test_numbers_that_are_no_picture_keep_their_digits() -> None:
     space = spaces.Box(-1e6, 1e6, (2, 3, 3), np.float32)
     model = make_policy(space).world_model
     grid = th.full((1, 2, 3, 3), 1234.5678)
-    assert th.equal(cast(th.Tensor, model._preprocess(grid)), grid)
+    assert th.equal(cast(th.Tensor, model.preprocessing(grid)), grid.flatten(1))
 
 
 def test_background_is_the_median() -> None:

@@ -7,7 +7,6 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 
 from sb3_esad.common.actor import Actor
 from sb3_esad.common.critics import CostCritic, QEnsemble
-from sb3_esad.common.precision import autocast
 from sb3_esad.common.type_aliases import Belief, LatentState
 from sb3_esad.common.world_model import WorldModel
 
@@ -15,6 +14,8 @@ from sb3_esad.common.world_model import WorldModel
 class LatentAgent(NamedTuple):
     """
     A world model, the actor that acts on its states, and the critics that judge what it does; its memory is the caller's.
+
+    It acts in full precision: to convert the networks to bfloat16 takes longer than that saves on a few states.
 
     :param world_model: filters observations
     :param actor: proposes actions
@@ -39,9 +40,8 @@ class LatentAgent(NamedTuple):
         :return: the present state, and the embedding of the observation
         """
         kept = state.map(lambda field: field.masked_fill(episode_start.view(-1, *[1] * (field.dim() - 1)), 0.0))
-        with autocast(episode_start.device):
-            embedding = self.world_model.embed(observation)
-            return Belief(self.world_model.rssm.filter(kept, embedding, deterministic), embedding)
+        embedding = self.world_model.embed(observation)
+        return Belief(self.world_model.rssm.filter(kept, embedding, deterministic), embedding)
 
     @th.no_grad()
     def act(self, state: LatentState, deterministic: bool = False) -> th.Tensor:
@@ -52,5 +52,4 @@ class LatentAgent(NamedTuple):
         :param deterministic: take the mode instead of a sample
         :return: actions scaled to [-1, 1], of shape (N, A)
         """
-        with autocast(state.action.device):
-            return self.actor(self.world_model.features(state), deterministic)
+        return self.actor(self.world_model.features(state), deterministic)

@@ -14,6 +14,8 @@ CHANNELS_OF_ONE_CELL = 32
 FOREGROUND_CONTRAST = 0.1
 MEDIAN_SAMPLE = 32
 MEDIAN_RATE = 0.02
+PRECISION = 10.0
+"""Weight of a standardised entry: with 1, to remember it well is not worth its price in the KL (docs/experiments.md, 22)."""
 
 
 class ObservationHead(nn.Module, ABC):
@@ -127,10 +129,10 @@ def _spread(grid_shape: GridShape, cells: tuple[int, int]) -> tuple[nn.Module, i
 
 class VectorHead(ObservationHead):
     """
-    Reconstruct a flat observation as its symmetric logarithm.
+    Reconstruct a standardised vector as its symmetric logarithm, for which an outlier is not worth more than all the rest.
 
     :param grid_shape: shape of the latent grid (C, H, W)
-    :param size: length of the observation after SB3's preprocessing
+    :param size: length of the vector
     :param units: units of the hidden layer
     """
 
@@ -143,16 +145,16 @@ class VectorHead(ObservationHead):
         Reconstruct vectors.
 
         :param grid: latent states, of shape (N, C, H, W)
-        :return: preprocessed observations, of shape (N, size)
+        :return: standardised vectors, of shape (N, size)
         """
         return symexp(self.layers(grid))
 
     def loss(self, grid: th.Tensor, observations: th.Tensor) -> th.Tensor:
         """
-        Sum the squared error over entries, average it over the batch.
+        Sum the weighted squared error over entries, average it over the batch.
 
         :param grid: latent states, of shape (N, C, H, W)
-        :param observations: preprocessed, of shape (N, ...)
+        :param observations: standardised, of shape (N, size)
         :return: scalar
         """
-        return (self.layers(grid).float() - symlog(observations.flatten(1))).square().sum(1).mean()
+        return PRECISION * (self.layers(grid).float() - symlog(observations)).square().sum(1).mean()

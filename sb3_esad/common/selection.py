@@ -149,7 +149,6 @@ class SafetyFilter(ActionFilter):
     def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
         if not self.is_active():
             return NoFilter().select(agent, belief, proposed)
-        # In full precision, for the few states of a decision take longer to be converted than to be computed
         scenarios = self.worst(agent, draw_scenarios(agent, belief, self.n_candidates), proposed)
         own = self.assess(agent, scenarios, proposed[None])
         doubtful = ~self._admissible(own)[0]

@@ -1,13 +1,12 @@
 """The world model: a recurrent state-space model with heads for observation, reward, cost and continuation."""
 
 from collections.abc import Callable, ItemsView
-from typing import Any, cast
+from typing import cast
 
 import torch as th
 from gymnasium import spaces
-from stable_baselines3.common.preprocessing import get_flattened_obs_dim, is_image_space, preprocess_obs
+from stable_baselines3.common.preprocessing import get_flattened_obs_dim
 from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
-from stable_baselines3.common.type_aliases import TensorDict
 from torch import nn
 
 from sb3_esad.common.checks import require
@@ -15,11 +14,10 @@ from sb3_esad.common.decoders import ImageHead, ObservationHead, VectorHead
 from sb3_esad.common.extractors import grid_shape
 from sb3_esad.common.heads import PredictionHeads
 from sb3_esad.common.precision import working_dtype
+from sb3_esad.common.preprocessing import Observations, Preprocessing, by_key, map_observations, spaces_by_key
 from sb3_esad.common.rssm import RSSM, Filtered
 from sb3_esad.common.torch_layers import GridShape, LearningModule, join
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, Predictions, SequenceSamples
-
-Observations = th.Tensor | TensorDict
 
 
 class WorldModel(LearningModule):
@@ -55,8 +53,7 @@ class WorldModel(LearningModule):
         require(sparsity_weight >= 0, "sparsity_weight", sparsity_weight, "a weight >= 0")
         require(foreground_weight >= 0, "foreground_weight", foreground_weight, "a weight >= 0")
         require(open_loop_length >= 1, "open_loop_length", open_loop_length, "a number of steps >= 1")
-        self.observation_space = observation_space
-        self.normalize_images = normalize_images
+        self.preprocessing = Preprocessing(observation_space, normalize_images)
         self.open_loop_length = open_loop_length
         self.features_extractor = features_extractor
         self.embedding_shape = grid_shape(features_extractor)
@@ -65,28 +62,17 @@ class WorldModel(LearningModule):
         grid = (channels, *rssm.memory_shape[1:])
         self.predictions = PredictionHeads(grid, units, cost_weight, sparsity_weight)
         self.observations = nn.ModuleDict(
-            {key: self._make_head(space, grid, foreground_weight) for key, space in _spaces_by_key(observation_space).items()}
+            {
+                key: self._make_head(key, space, grid, foreground_weight)
+                for key, space in spaces_by_key(observation_space).items()
+            }
         )
 
-    def _make_head(self, space: spaces.Space, grid: GridShape, foreground_weight: float) -> ObservationHead:
-        if is_image_space(space, normalized_image=not self.normalize_images):
+    def _make_head(self, key: str, space: spaces.Space, grid: GridShape, foreground_weight: float) -> ObservationHead:
+        if key in self.preprocessing.image_keys:
             assert space.shape is not None
             return ImageHead(grid, space.shape, foreground_weight)
         return VectorHead(grid, get_flattened_obs_dim(space))
-
-    def images(self, observations: dict[str, Any] | Any) -> dict[str, Any]:
-        """
-        Pick out what is shown as an image.
-
-        :param observations: one observation of any type, or one for each key of a Dict space
-        :return: the images by key, the key of a single observation is "observation"
-        """
-        return {key: _by_key(observations)[key] for key in self.image_keys}
-
-    @property
-    def image_keys(self) -> list[str]:
-        """Keys of the observations that are shown as an image."""
-        return [key for key, head in self._observation_heads() if isinstance(head, ImageHead)]
 
     def initial(self, n: int) -> LatentState:
         """
@@ -104,7 +90,7 @@ class WorldModel(LearningModule):
         :param observations: as stored, of shape (N, ...)
         :return: embeddings for the posterior, of shape (N, C, H, W)
         """
-        features = self.features_extractor(self._preprocess(observations))
+        features = self.features_extractor(self.preprocessing(observations))
         return self.rssm.head.embed(features.unflatten(1, self.embedding_shape))
 
     def filter(
@@ -137,8 +123,8 @@ class WorldModel(LearningModule):
         actions = samples.actions.transpose(0, 1)
         is_first = samples.is_first.transpose(0, 1).clone()
         is_first[0] = True  # the model starts afresh at the start of a window too
-        opening = _map(samples.observations, lambda x: x.transpose(0, 1)[is_first])
-        embeddings = self.embed(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)))
+        opening = map_observations(samples.observations, lambda x: x.transpose(0, 1)[is_first])
+        embeddings = self.embed(map_observations(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)))
         first = self.filter(self.initial(int(is_first.sum())), opening, generator=generator)
         return self.rssm.scan(first, is_first, actions, embeddings.unflatten(0, actions.shape[:2]), hidden, generator)
 
@@ -186,7 +172,7 @@ class WorldModel(LearningModule):
         Show what the states look like.
 
         :param states: N states
-        :return: preprocessed observations by key, of shape (N, ...); the key of a single observation is "observation"
+        :return: observations by key as SB3 preprocesses them, vectors flat; the key of a single observation is "observation"
         """
         return self.decode(self.features(states))
 
@@ -197,7 +183,7 @@ class WorldModel(LearningModule):
         :param grids: features, of shape (N, C, H, W)
         :return: see :meth:`reconstruct`
         """
-        return {key: head(grids) for key, head in self._observation_heads()}
+        return self.preprocessing.invert({key: head(grids) for key, head in self._observation_heads()})
 
     def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, Logs]:
         """
@@ -208,6 +194,7 @@ class WorldModel(LearningModule):
         :return: scalar loss, the filtered states, and what to log
         """
         steps = samples.rewards.T
+        self.preprocessing.follow(map_observations(samples.next_observations, lambda x: x.flatten(0, 1)))
         filtered = self.observe(samples, self._withhold(steps, generator), generator)
         grid = self.features(filtered.states.map(lambda field: field.flatten(0, 1)))
         targets = Predictions(*(field.T.flatten() for field in (samples.rewards, samples.costs, samples.continues)))
@@ -217,8 +204,9 @@ class WorldModel(LearningModule):
         some = th.randperm(len(grid), device=grid.device, generator=generator)[: (len(grid) + 1) // 2]
         distributions = (filtered.posterior, filtered.prior)
         head_loss, head_logs = self.rssm.head.loss(*distributions, filtered.states.memory, filtered.embeddings, generator)
-        seen = self._preprocess(_map(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)[some]))
-        observation_losses = [head.loss(grid[some], _by_key(seen)[key]) for key, head in self._observation_heads()]
+        shown = map_observations(samples.next_observations, lambda x: x.transpose(0, 1).flatten(0, 1)[some])
+        seen = by_key(self.preprocessing(shown))
+        observation_losses = [head.loss(grid[some], seen[key]) for key, head in self._observation_heads()]
         observation_loss = th.stack(observation_losses).sum()
         loss = observation_loss + prediction_loss + head_loss
         return loss, filtered, {**logs, **head_logs, "observation_loss": observation_loss.item()}
@@ -233,25 +221,3 @@ class WorldModel(LearningModule):
 
     def _observation_heads(self) -> ItemsView[str, ObservationHead]:
         return cast(ItemsView[str, ObservationHead], self.observations.items())
-
-    def _preprocess(self, observations: Observations) -> Observations:
-        # Images are as exact in bfloat16 as they were as bytes, and half as large
-        preprocessed = preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images)
-        if isinstance(preprocessed, dict):
-            images = self.images(preprocessed)
-            return {key: x.to(working_dtype(x.device)) if key in images else x for key, x in preprocessed.items()}
-        return preprocessed.to(working_dtype(preprocessed.device)) if self.images(preprocessed) else preprocessed
-
-
-def _by_key(observations: Observations) -> TensorDict:
-    return observations if isinstance(observations, dict) else {"observation": observations}
-
-
-def _spaces_by_key(space: spaces.Space) -> dict[str, spaces.Space]:
-    return space.spaces if isinstance(space, spaces.Dict) else {"observation": space}
-
-
-def _map(observations: Observations, function: Callable[[th.Tensor], th.Tensor]) -> Observations:
-    if isinstance(observations, dict):
-        return {key: function(value) for key, value in observations.items()}
-    return function(observations)

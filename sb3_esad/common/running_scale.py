@@ -1,0 +1,64 @@
+"""Numbers at a common scale, however they are measured."""
+
+import torch as th
+from torch import nn
+
+MIN_STD = 1e-4
+MIN_RATE = 1e-3
+
+
+class RunningScale(nn.Module):
+    """
+    Standardise each entry of a vector by its running mean and deviation, as SB3's ``VecNormalize`` does outside of a model.
+
+    What is reconstructed by squared errors is learned the better the more it varies: of entries within a tenth of a unit, as a
+    distance of ten metres where a hundred are 1, a model would learn next to nothing (docs/experiments.md, section 22).
+
+    :param size: length of the vectors
+    """
+
+    mean: th.Tensor
+    variance: th.Tensor
+    n_batches: th.Tensor
+
+    def __init__(self, size: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", th.zeros(size))
+        self.register_buffer("variance", th.ones(size))
+        self.register_buffer("n_batches", th.tensor(0))
+
+    @th.no_grad()
+    def follow(self, vectors: th.Tensor) -> None:
+        """
+        Take note of a batch: the first thousand count alike, then the latest ones a little more.
+
+        :param vectors: shape (N, size)
+        """
+        self.n_batches += 1
+        rate = (1 / self.n_batches).clamp(min=MIN_RATE)
+        variance, mean = th.var_mean(vectors, dim=0, correction=0)
+        change = mean - self.mean
+        self.mean += rate * change
+        self.variance += rate * (variance + (1 - rate) * change.square() - self.variance)
+
+    def forward(self, vectors: th.Tensor) -> th.Tensor:
+        """
+        Standardise.
+
+        :param vectors: shape (N, size)
+        :return: shape (N, size)
+        """
+        return (vectors - self.mean) / self._std
+
+    def invert(self, scaled: th.Tensor) -> th.Tensor:
+        """
+        Inverse of :meth:`forward`.
+
+        :param scaled: shape (N, size)
+        :return: shape (N, size)
+        """
+        return scaled * self._std + self.mean
+
+    @property
+    def _std(self) -> th.Tensor:
+        return self.variance.sqrt().clamp(min=MIN_STD)
