@@ -100,7 +100,7 @@ def test_memory_holds_the_action() -> None:
     model = make_model("MlpPolicy")
     first, second = observe(model, n_envs=1, steps=2)
     action, (memory, latent, remembered) = model.predict(first, deterministic=True)  # type: ignore[misc]
-    np.testing.assert_allclose(remembered[0], action)
+    np.testing.assert_allclose(remembered[0], action, rtol=1e-6)
     assert memory.shape == (1, 1, 8) and latent.shape == (1, 1, 4)
     assert all(array.dtype == np.float32 for array in (memory, latent, remembered))
     one, _ = model.predict(second, (memory, latent, remembered), deterministic=True)

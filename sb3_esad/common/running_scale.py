@@ -25,7 +25,7 @@ class RunningScale(nn.Module):
         super().__init__()
         self.register_buffer("mean", th.zeros(size))
         self.register_buffer("variance", th.ones(size))
-        self.register_buffer("n_batches", th.tensor(0))
+        self.register_buffer("n_batches", th.tensor(0.0))
 
     @th.no_grad()
     def follow(self, vectors: th.Tensor) -> None:
