@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from sb3_esad.common.imagined_returns import imagined_costs
 from sb3_esad.common.noise import fixed_seed
-from sb3_esad.common.precision import autocast
 from sb3_esad.common.selection import Selection, draw_scenarios
 from sb3_esad.esad_lend import ESADLEND
 
@@ -77,7 +76,7 @@ class ExplainedDriver:
         :return: the futures
         """
         agent = self.model.policy.average
-        with fixed_seed(self.model.device), autocast(self.model.device):
+        with fixed_seed(self.model.device):
             scenarios = draw_scenarios(agent, self._belief, self.n_futures).map(lambda field: field.flatten(0, 1))
             start = scenarios._replace(action=self.selection.actions.repeat(self.n_futures, 1))
             imagined = agent.world_model.imagine(

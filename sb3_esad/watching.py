@@ -13,7 +13,6 @@ from sb3_esad.common.cost_limited_algorithm import CostLimitedAlgorithm
 from sb3_esad.common.latent_algorithm import LatentAlgorithm
 from sb3_esad.common.noise import fixed_seed
 from sb3_esad.common.policies import LatentPolicy
-from sb3_esad.common.precision import autocast
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.film import side_by_side, write_film
 
@@ -101,7 +100,7 @@ def imagine_episode(
     :return: preprocessed observations by key, of shape (L + 1, ...)
     """
     agent, start = policy.average, th.ones(1, dtype=th.bool, device=policy.device)
-    with fixed_seed(policy.device), autocast(policy.device):
+    with fixed_seed(policy.device):
         states = [agent.observe(_at(before, 0), policy.initial_state(1), start, deterministic=True).state]
         for step, action in enumerate(actions):
             state = states[-1]._replace(action=action[None])

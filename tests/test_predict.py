@@ -10,7 +10,6 @@ from stable_baselines3.common.envs import FakeImageEnv, IdentityEnvBox
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_esad import ESADLEND
-from sb3_esad.common import precision
 from sb3_esad.common.target_networks import update_target
 from tests.conftest import SPACES, TINY, VECTOR, CountingEnv, RandomEnv
 
@@ -41,14 +40,8 @@ def pick(observation: Observation, index: Any) -> Observation:
     return {key: part[index] for key, part in observation.items()} if isinstance(observation, dict) else observation[index]
 
 
-@pytest.fixture
-def float32(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Full precision: sums of bfloat16 depend on the size of the batch."""
-    monkeypatch.setattr(precision, "has_fast_bfloat16", lambda device: False)
-
-
 @pytest.mark.parametrize("policy", SPACES)
-def test_together_is_one_by_one(policy: str, float32: None) -> None:
+def test_together_is_one_by_one(policy: str) -> None:
     """Whatever the others see, and whenever their episodes start."""
     model = make_model(policy)
     observations = observe(model, n_envs=3, steps=4)

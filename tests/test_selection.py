@@ -101,9 +101,28 @@ def test_an_action_is_as_risky_as_in_its_worst_scenarios(agent: LatentAgent, ris
     safety = SafetyFilter(AugmentedLagrangian(0.05), lambda: True, Known(0.0), risk_level, n_candidates=4)
     state = agent.world_model.initial(2).map(lambda field: field.expand(4, *field.shape))
     vague = th.tensor([[3.0, 1.0, 4.0, 2.0], [10.0, 20.0, 30.0, 40.0]]).T
-    scenarios = safety.worst(agent, state._replace(memory=state.memory + vague[..., None, None, None]), th.ones(2, 1))
+    scenarios = state._replace(memory=state.memory + vague[..., None, None, None])
     outlook = safety.assess(agent, scenarios, th.ones(3, 2, 1))
     th.testing.assert_close(outlook.risks, th.tensor([expected, 10 * expected]).expand(3, 2))
+
+
+class Sided(Known):
+    """In some worlds only what is done to the right is dangerous, in the others only what is done to the left."""
+
+    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
+        action = start.action[:, 0]
+        return Outlook(action, (action * start.memory[:, 0, 0, 0]).relu(), th.zeros_like(action))
+
+    def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
+        return (actions[:, 0] * grids[:, 0, 0, 0]).relu()
+
+
+def test_each_action_has_its_own_worst_scenarios(agent: LatentAgent) -> None:
+    safety = SafetyFilter(AugmentedLagrangian(0.05), lambda: True, Sided(0.0), risk_level=0.5, n_candidates=4)
+    state = agent.world_model.initial(1).map(lambda field: field.expand(4, *field.shape))
+    side = th.tensor([1.0, -1.0, 1.0, -1.0]).view(4, 1, 1, 1, 1)
+    outlook = safety.assess(agent, state._replace(memory=state.memory + side), th.tensor([[[0.9]], [[-0.8]], [[0.0]]]))
+    th.testing.assert_close(outlook.risks, th.tensor([[0.9], [0.8], [0.0]]))
 
 
 @pytest.mark.parametrize("passive", [NoFilter(), make_filter(calm=5.0, active=False)])
@@ -119,11 +138,12 @@ def test_without_a_limit_everything_is_admissible(agent: LatentAgent) -> None:
     assert th.equal(safety.select(agent, belief(agent, 4), proposed).actions, proposed)
 
 
-def test_foresight_is_what_model_and_critics_say(agent: LatentAgent) -> None:
+@pytest.mark.parametrize("risk_level", [0.5, 1.0])
+def test_foresight_is_what_model_and_critics_say(agent: LatentAgent, risk_level: float) -> None:
     """One imagined step by hand; the prior is made certain, so that it is the same each time."""
     agent.world_model.rssm.head.prior_net[1].bias.data[4:] = -100.0
     state = agent.world_model.initial(3)._replace(action=2 * th.rand(3, 1) - 1)
-    foresight = Foresight(steps=1, gamma=0.9, cost_gamma=0.8, risk_level=1.0, barrier_decay=0.3)
+    foresight = Foresight(steps=1, gamma=0.9, cost_gamma=0.8, risk_level=risk_level, barrier_decay=0.3)
     th.manual_seed(0)
     outlook = foresight(agent, state)
     th.manual_seed(0)
@@ -131,9 +151,11 @@ def test_foresight_is_what_model_and_critics_say(agent: LatentAgent) -> None:
     rewards, costs, continues = (field[0] for field in agent.world_model.predict(grid[None]))
     action = agent.actor(grid, deterministic=True)
     th.testing.assert_close(outlook.values, rewards + 0.9 * continues * agent.critic(grid, action).min(0).values)
-    means, _ = agent.cost_critic(grid, action)
-    th.testing.assert_close(outlook.risks, costs + 0.8 * continues * means.max(0).values)
-    th.testing.assert_close(outlook.next_risks, means.max(0).values)
+    means, end_variance = agent.cost_critic(grid, action)
+    _, variance = agent.cost_critic(agent.world_model.features(state), state.action)
+    to_come = costs + 0.8 * continues * means.max(0).values
+    th.testing.assert_close(outlook.risks, agent.cost_critic.risk(to_come[None], variance, risk_level))
+    th.testing.assert_close(outlook.next_risks, agent.cost_critic.risk(means, end_variance, risk_level))
     expected = barrier_residual(outlook.next_risks, outlook.risks, 0.1, 0.3)
     th.testing.assert_close(foresight.barrier(outlook, 0.1), expected)
 

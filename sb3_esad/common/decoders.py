@@ -14,8 +14,6 @@ CHANNELS_OF_ONE_CELL = 32
 FOREGROUND_CONTRAST = 0.1
 MEDIAN_SAMPLE = 32
 MEDIAN_RATE = 0.02
-PRECISION = 10.0
-"""Weight of a standardised entry: with 1, to remember it well is not worth its price in the KL (docs/experiments.md, 22)."""
 
 
 class ObservationHead(nn.Module, ABC):
@@ -129,15 +127,17 @@ def _spread(grid_shape: GridShape, cells: tuple[int, int]) -> tuple[nn.Module, i
 
 class VectorHead(ObservationHead):
     """
-    Reconstruct a standardised vector as its symmetric logarithm, for which an outlier is not worth more than all the rest.
+    Reconstruct a standardised vector as its symmetric logarithm.
 
     :param grid_shape: shape of the latent grid (C, H, W)
     :param size: length of the vector
+    :param weight: of the squared errors
     :param units: units of the hidden layer
     """
 
-    def __init__(self, grid_shape: GridShape, size: int, units: int = 256) -> None:
+    def __init__(self, grid_shape: GridShape, size: int, weight: float = 1.0, units: int = 256) -> None:
         super().__init__()
+        self.weight = weight
         self.layers = nn.Sequential(GridReadout(grid_shape, units), nn.Linear(units, size))
 
     def forward(self, grid: th.Tensor) -> th.Tensor:
@@ -154,7 +154,7 @@ class VectorHead(ObservationHead):
         Sum the weighted squared error over entries, average it over the batch.
 
         :param grid: latent states, of shape (N, C, H, W)
-        :param observations: standardised, of shape (N, size)
+        :param observations: standardised, of shape (N, ...)
         :return: scalar
         """
-        return PRECISION * (self.layers(grid).float() - symlog(observations)).square().sum(1).mean()
+        return self.weight * (self.layers(grid).float() - symlog(observations.flatten(1))).square().sum(1).mean()

@@ -61,8 +61,8 @@ class Foresight:
         means, variances = agent.cost_critic(*begin_and_end)
         end_costs, (variance, end_variance) = means.chunk(2, 1)[1], variances.chunk(2)
         values = _sum_up(rewards, continues, agent.critic(*ends).min(0).values, self.gamma)
-        costs = _sum_up(costs, continues, end_costs.max(0).values, self.cost_gamma)
-        risks = agent.cost_critic.risk(costs[None], variance, self.risk_level)
+        cost_to_come = _sum_up(costs, continues, end_costs.max(0).values, self.cost_gamma)
+        risks = agent.cost_critic.risk(cost_to_come[None], variance, self.risk_level)
         return Outlook(values, risks, agent.cost_critic.risk(end_costs, end_variance, self.risk_level))
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:

@@ -17,7 +17,7 @@ Observations = th.Tensor | TensorDict
 
 class Preprocessing(nn.Module):
     """
-    SB3's preprocessing; thereafter vectors are flat and standardised.
+    SB3's preprocessing; thereafter all but images is standardised.
 
     :param observation_space: space of the observations, images channel-first
     :param normalize_images: whether images are bytes to be divided by 255
@@ -39,12 +39,12 @@ class Preprocessing(nn.Module):
         Prepare observations for the networks.
 
         :param observations: as stored, of shape (N, ...)
-        :return: images and standardised vectors
+        :return: of the same shapes, images first
         """
         preprocessed = by_key(preprocess_obs(observations, self.observation_space, normalize_images=self.normalize_images))
         # Images are as exact in bfloat16 as they were as bytes, and half as large
         prepared = {key: image.to(working_dtype(image.device)) for key, image in self.images(preprocessed).items()}
-        prepared |= {key: scale(preprocessed[key].flatten(1)) for key, scale in self._scales()}
+        prepared |= {key: scale(preprocessed[key].flatten(1)).view_as(preprocessed[key]) for key, scale in self._scales()}
         return prepared if isinstance(observations, dict) else prepared["observation"]
 
     def follow(self, observations: Observations) -> None:

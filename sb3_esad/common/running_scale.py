@@ -5,14 +5,15 @@ from torch import nn
 
 MIN_STD = 1e-4
 MIN_RATE = 1e-3
+CLIP = 10.0
 
 
 class RunningScale(nn.Module):
     """
     Standardise each entry of a vector by its running mean and deviation, as SB3's ``VecNormalize`` does outside of a model.
 
-    What is reconstructed by squared errors is learned the better the more it varies: of entries within a tenth of a unit, as a
-    distance of ten metres where a hundred are 1, a model would learn next to nothing (docs/experiments.md, section 22).
+    By squared errors, what varies little is hardly learned: of a car's distance, which is below .1 where 100 m are 1, next to
+    nothing (docs/experiments.md, section 22). What is ten deviations off is cut, and counts no more than that.
 
     :param size: length of the vectors
     """
@@ -34,6 +35,8 @@ class RunningScale(nn.Module):
 
         :param vectors: shape (N, size)
         """
+        if self.n_batches > 0:
+            vectors = self.invert(self(vectors))
         self.n_batches += 1
         rate = (1 / self.n_batches).clamp(min=MIN_RATE)
         variance, mean = th.var_mean(vectors, dim=0, correction=0)
@@ -48,11 +51,11 @@ class RunningScale(nn.Module):
         :param vectors: shape (N, size)
         :return: shape (N, size)
         """
-        return (vectors - self.mean) / self._std
+        return ((vectors - self.mean) / self._std).clamp(-CLIP, CLIP)
 
     def invert(self, scaled: th.Tensor) -> th.Tensor:
         """
-        Inverse of :meth:`forward`.
+        Inverse of :meth:`forward`, but for what it cut.
 
         :param scaled: shape (N, size)
         :return: shape (N, size)

@@ -116,15 +116,15 @@ class SafetyFilter(ActionFilter):
     """
     Replaces an action that is not admissible by the most promising one that is, or else by the least risky one.
 
-    Latents drawn from P(z | h, o) are scenarios: an action is as risky as in the worst of them, and only those that critics
-    fear most are imagined. To choose among latents, as in figure 3 of arXiv 2407.06317, would be to choose the world in which
-    there is no car.
+    Latents drawn from P(z | h, o) are scenarios: an action is as risky as in the worst of them, which are those in which
+    critics fear it most; only these are imagined. To choose among latents, as in figure 3 of arXiv 2407.06317, would be to
+    choose the world in which there is no car.
 
     :param penalty: tells what is admissible
     :param is_active: whether the critics may be trusted with that
     :param foresight: imagines where an action leads
     :param risk_level: fraction of the worst scenarios that counts
-    :param n_candidates: scenarios of which the critics choose the worst
+    :param n_candidates: scenarios of which the critics choose the worst for each action
     :param n_proposals: samples of the actor, and as many uniform actions, that the critics sift where the actor's own action
         is not admissible
     """
@@ -149,7 +149,7 @@ class SafetyFilter(ActionFilter):
     def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
         if not self.is_active():
             return NoFilter().select(agent, belief, proposed)
-        scenarios = self.worst(agent, draw_scenarios(agent, belief, self.n_candidates), proposed)
+        scenarios = draw_scenarios(agent, belief, self.n_candidates)
         own = self.assess(agent, scenarios, proposed[None])
         doubtful = ~self._admissible(own)[0]
         actions, helpless = proposed.clone(), th.zeros_like(doubtful)
@@ -160,36 +160,27 @@ class SafetyFilter(ActionFilter):
             actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful], known)
         return Selection(actions, (actions != proposed).any(1), helpless)
 
-    def worst(self, agent: LatentAgent, scenarios: LatentState, proposed: th.Tensor) -> LatentState:
-        """
-        Choose the scenarios that count: those in which the critics fear an action most.
-
-        :param agent: whose critics judge
-        :param scenarios: fields of shape (M, N, ...)
-        :param proposed: the actions, of shape (N, A)
-        :return: the worst fraction ``risk_level`` of the scenarios, at least one
-        """
-        n_scenarios, n_states = scenarios.memory.shape[:2]
-        grids = agent.world_model.features(scenarios.map(lambda field: field.flatten(0, 1)))
-        risks = self.foresight.risk(agent, grids, proposed.repeat(n_scenarios, 1)).view(n_scenarios, n_states)
-        worst = risks.topk(math.ceil(self.risk_level * n_scenarios), dim=0).indices
-        return scenarios.map(lambda field: field[worst, th.arange(n_states, device=field.device)])
-
     def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> Outlook:
         """
-        Foresee where actions lead, on average over the scenarios.
+        Foresee where actions lead, on average over the scenarios that are the worst for each of them.
 
         :param agent: whose world model and critics judge
         :param scenarios: fields of shape (M, N, ...)
         :param proposals: P actions for each of N states, of shape (P, N, A)
         :return: fields of shape (P, N)
         """
-        n_proposals, n_states = proposals.shape[:2]
-        n_scenarios = len(scenarios.memory)
-        states = scenarios.map(lambda field: field.repeat(n_proposals, *[1] * (field.dim() - 1)).flatten(0, 1))
-        actions = proposals.repeat_interleave(n_scenarios, 0).flatten(0, 1)
-        outlook = self.foresight(agent, states._replace(action=actions))
-        return Outlook(*(field.view(n_proposals, n_scenarios, n_states).mean(1) for field in outlook))
+        states = self._worst(agent, scenarios, proposals).map(lambda field: field.flatten(0, 2))
+        return Outlook(*(field.view(-1, *proposals.shape[:2]).mean(0) for field in self.foresight(agent, states)))
+
+    def _worst(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> LatentState:
+        """For each action the scenarios in which the critics fear it most, with fields of shape (scenarios, P, N, ...)."""
+        shape = (len(scenarios.memory), *proposals.shape[:2])
+        states = scenarios.map(lambda field: field[:, None].expand(*shape, *field.shape[2:]))
+        states = states._replace(action=proposals.expand(*shape, -1))
+        flat = states.map(lambda field: field.flatten(0, 2))
+        risks = self.foresight.risk(agent, agent.world_model.features(flat), flat.action).view(shape)
+        worst = risks.topk(math.ceil(self.risk_level * shape[0]), dim=0).indices
+        return states.map(lambda field: field.take_along_dim(worst.view(*worst.shape, *[1] * (field.dim() - 3)), dim=0))
 
     def _admissible(self, outlook: Outlook) -> th.Tensor:
         return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget))

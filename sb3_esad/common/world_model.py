@@ -14,9 +14,9 @@ from sb3_esad.common.decoders import ImageHead, ObservationHead, VectorHead
 from sb3_esad.common.extractors import grid_shape
 from sb3_esad.common.heads import PredictionHeads
 from sb3_esad.common.precision import working_dtype
-from sb3_esad.common.preprocessing import Observations, Preprocessing, by_key, map_observations, spaces_by_key
+from sb3_esad.common.preprocessing import Observations, Preprocessing, by_key, map_observations
 from sb3_esad.common.rssm import RSSM, Filtered
-from sb3_esad.common.torch_layers import GridShape, LearningModule, join
+from sb3_esad.common.torch_layers import LearningModule, join
 from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, Predictions, SequenceSamples
 
 
@@ -32,6 +32,7 @@ class WorldModel(LearningModule):
     :param cost_weight: weight of a cost event in the loss of the cost head
     :param sparsity_weight: price of each cell of a grid that the heads of cost and end look at
     :param foreground_weight: additional weight of the pixels that differ from the background
+    :param vector_weight: weight of what is no image in the reconstruction; more where much of it must be remembered
     :param open_loop_length: longest stretch without observation that the model is trained to bridge, in steps
     :raises ValueError: if a weight or the length is out of its range
     """
@@ -46,12 +47,14 @@ class WorldModel(LearningModule):
         cost_weight: float = 10.0,
         sparsity_weight: float = 0.03,
         foreground_weight: float = 10.0,
+        vector_weight: float = 1.0,
         open_loop_length: int = 8,
     ) -> None:
         super().__init__()
         require(cost_weight > 0, "cost_weight", cost_weight, "a weight > 0")
         require(sparsity_weight >= 0, "sparsity_weight", sparsity_weight, "a weight >= 0")
         require(foreground_weight >= 0, "foreground_weight", foreground_weight, "a weight >= 0")
+        require(vector_weight >= 0, "vector_weight", vector_weight, "a weight >= 0")
         require(open_loop_length >= 1, "open_loop_length", open_loop_length, "a number of steps >= 1")
         self.preprocessing = Preprocessing(observation_space, normalize_images)
         self.open_loop_length = open_loop_length
@@ -63,16 +66,12 @@ class WorldModel(LearningModule):
         self.predictions = PredictionHeads(grid, units, cost_weight, sparsity_weight)
         self.observations = nn.ModuleDict(
             {
-                key: self._make_head(key, space, grid, foreground_weight)
-                for key, space in spaces_by_key(observation_space).items()
+                key: ImageHead(grid, cast(tuple[int, ...], space.shape), foreground_weight)
+                if key in self.preprocessing.image_keys
+                else VectorHead(grid, get_flattened_obs_dim(space), vector_weight)
+                for key, space in self.preprocessing.spaces.items()
             }
         )
-
-    def _make_head(self, key: str, space: spaces.Space, grid: GridShape, foreground_weight: float) -> ObservationHead:
-        if key in self.preprocessing.image_keys:
-            assert space.shape is not None
-            return ImageHead(grid, space.shape, foreground_weight)
-        return VectorHead(grid, get_flattened_obs_dim(space))
 
     def initial(self, n: int) -> LatentState:
         """
@@ -187,7 +186,7 @@ class WorldModel(LearningModule):
 
     def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, Logs]:
         """
-        Fit the model to windows of recorded steps.
+        Fit the model to windows of recorded steps, and take note of the scale of vectors.
 
         :param samples: windows, batch-major
         :param generator: of all that is drawn; torch's global one if there is none
