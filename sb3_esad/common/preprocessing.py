@@ -54,7 +54,7 @@ class Preprocessing(nn.Module):
         :param observations: as stored, of shape (N, ...)
         """
         for key, scale in self._scales():
-            vectors = preprocess_obs(by_key(observations)[key], self.spaces[key])
+            vectors = preprocess_obs(by_key(observations)[key], self.spaces[key], normalize_images=self.normalize_images)
             assert isinstance(vectors, th.Tensor)
             scale.follow(vectors.flatten(1))
 
