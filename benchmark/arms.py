@@ -49,7 +49,6 @@ RECORDED: dict[str, Any] = {
     "replay_cost_critic_coef": 10.0,
     "replay_lambda": 0.95,
     "min_cost_critic_rate": 1 / 3,
-    "replay_buffer_kwargs": {"recency": 3.0},
 }
 """As with the settings of hyperparams/, which the demo's budget, that of all arms that imagine, replaces."""
 FILTER: dict[str, Any] = {"filter_start": 300}
@@ -99,6 +98,11 @@ EXPERIMENTS = {
         "Ahead of algorithms without a model?",
         (HIGHWAY, BRAKING),
         {name: Arm(name, {}) for name in ("esad_lend", "sac", "sac_lag", "wcsac")},
+    ),
+    "recency": Experiment(
+        "Shall what is newer be drawn more often?",
+        (HIGHWAY, BRAKING),
+        {"newer": Arm("esad_lend", {}), "all alike": Arm("esad_lend", {"replay_buffer_kwargs": {"recency": 0.0}})},
     ),
     "ablations": Experiment(
         "What are diffusion and safety worth?",

@@ -19,7 +19,7 @@ from matplotlib.figure import Figure
 from stable_baselines3.common.vec_env import DummyVecEnv
 
 from sb3_esad import ESADLEND
-from sb3_esad.demo import FIT_UPDATES, fit_cost_critic
+from sb3_esad.demo import FIT_UPDATES
 
 UNSEEN = 3_000_000
 BINS = 10
@@ -130,21 +130,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path)
     parser.add_argument("--buffer", type=Path, help="of the model: fit its critics first, which the demo has done")
-    parser.add_argument("--imagined-coef", type=float, help="weight of imagined transitions in that fit")
+    parser.add_argument("--imagined-coef", type=float, default=0.0, help="weight of imagined transitions in that fit")
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--n-envs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=UNSEEN)
     parser.add_argument("--out", type=Path, default=Path("calibration.png"))
     args = parser.parse_args()
-    if args.imagined_coef is not None and args.buffer is None:
+    if args.imagined_coef > 0 and args.buffer is None:
         parser.error(f"--imagined-coef is {args.imagined_coef}, but nothing is fitted: add --buffer")
     model = ESADLEND.load(args.model, device="cpu")
     if args.buffer is not None:
         model.load_replay_buffer(args.buffer)
-        fit_cost_critic(model) if args.imagined_coef is None else model.fit_cost_critic(
-            FIT_UPDATES, imagined_coef=args.imagined_coef
-        )
+        model.fit_cost_critic(FIT_UPDATES, imagined_coef=args.imagined_coef)
     visits = drive(model, args.env, args.steps, args.n_envs, args.seed)
     bins = by_expectation(visits)
     for name, each in [("all", visits), *((str(index), each) for index, each in enumerate(bins))]:

@@ -2,7 +2,8 @@
 Learning curves of driving: ``python benchmark/driving.py esad_lend --seed 0 --steps 20000 --out runs``.
 
 One run trains one algorithm with one seed, stops every so often to drive unseen episodes with the best and with sampled
-actions, and appends a line of JSON for each to ``OUT/<algorithm>_<seed>.jsonl``. Time spent on evaluation does not count.
+actions, and appends a line of JSON for each to ``OUT/<algorithm>_<seed>.jsonl``; the log of the training goes into the folder
+``OUT/<algorithm>_<seed>``. Time spent on evaluation does not count.
 """
 
 import argparse
@@ -18,6 +19,7 @@ import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
+from stable_baselines3.common.logger import configure
 from stable_baselines3.common.off_policy_algorithm import OffPolicyAlgorithm
 from stable_baselines3.common.preprocessing import is_image_space
 from variants import VARIANTS
@@ -170,7 +172,9 @@ def main() -> None:
     path.unlink(missing_ok=True)
     curve = LearningCurve(path, args.env, args.every, range(args.unseen, args.unseen + args.episodes))
     changes = {**(FEW_UPDATES if args.few_updates else {}), **args.set}
-    model = ALGORITHMS[args.algorithm](args.env, args.seed, changes).learn(args.steps, callback=curve)
+    model = ALGORITHMS[args.algorithm](args.env, args.seed, changes)
+    model.set_logger(configure(str(path.with_suffix("")), ["csv"]))
+    model.learn(args.steps, callback=curve)
     if args.save_buffer:
         model.save_replay_buffer(path.with_suffix(".pkl"))
 

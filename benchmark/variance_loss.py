@@ -19,7 +19,7 @@ from stable_baselines3.common.type_aliases import PyTorchObs
 from sb3_esad import ESADLEND
 from sb3_esad.common.critics import CostCritic
 from sb3_esad.common.functional import wasserstein2
-from sb3_esad.demo import fit_cost_critic
+from sb3_esad.demo import FIT_UPDATES
 from sb3_esad.esad_lend.policies import CnnPolicy
 
 
@@ -71,7 +71,7 @@ def fit(policy_class: type[CnnPolicy], path: Path, buffer: Path, env_id: str) ->
     if unexpected or any(".variance." not in name for name in missing):
         raise ValueError(f"{path} has other networks than a default model of {env_id}: train one without policy_kwargs.")
     model.load_replay_buffer(buffer)
-    fit_cost_critic(model)
+    model.fit_cost_critic(FIT_UPDATES)
     return model
 
 

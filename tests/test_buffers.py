@@ -16,7 +16,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecNormalize
 
 from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.type_aliases import NO_EVENT, SequenceSamples
-from sb3_esad.common.windows import WindowIndex, event_weights, recency_weights, time_to_event
+from sb3_esad.common.windows import WindowIndex, event_weights, time_to_event
 from tests.conftest import CountingEnv
 
 EPISODE = 7
@@ -182,8 +182,7 @@ def test_event_windows_equal_brute_force(n_envs: int, length: int) -> None:
         costs = np.random.rand(40, n_envs) < probability
         windows = WindowIndex(costs, length)
         expected = event_starts(costs, length)
-        assert windows.n_windows == (41 - length) * n_envs
-        assert windows.n_event_windows == len(expected)
+        assert windows.event_share == pytest.approx(len(expected) / ((41 - length) * n_envs))
         if expected:
             drawn = windows.draw_events(200 * len(expected))
             pairs, counts = np.unique(np.stack(drawn), axis=1, return_counts=True)
@@ -208,7 +207,7 @@ def test_half_of_a_batch_has_events() -> None:
 
 
 def test_events_are_found_in_a_wrapped_buffer() -> None:
-    buffer = make_buffer(make_env(), size=50, length=5)
+    buffer = make_buffer(make_env(), size=50, length=5, recency=0.0)
     costs = np.zeros((127, 1))
     costs[[20, 90]] = 1
     add_costs(buffer, costs)
@@ -221,10 +220,10 @@ def test_events_are_found_in_a_wrapped_buffer() -> None:
 
 
 def test_known_weights() -> None:
-    weights = event_weights(np.array([True, False]), 0.5, 1000, 20)
+    weights = event_weights(np.array([True, False]), 0.5, 0.02)
     assert weights.tolist() == pytest.approx([1 / 25.5, 2.0])
     assert weights[0] == pytest.approx(0.0392, abs=1e-4)
-    assert event_weights(np.array([False]), 0.0, 10, 0).tolist() == [1.0]
+    assert event_weights(np.array([False]), 0.0, 0.0).tolist() == [1.0]
 
 
 @pytest.mark.parametrize(("fraction", "recency"), [(0.25, 0.0), (0.5, 0.0), (0.5, 3.0)])
@@ -246,11 +245,20 @@ def test_weights_are_unbiased(fraction: float, recency: float) -> None:
     assert np.std(weighted) / np.sqrt(2000) < 0.02 * expected
 
 
-def test_known_recency() -> None:
-    weights = recency_weights(np.linspace(0.0, 1.0, 1001), 3.0)
-    assert weights.mean() == pytest.approx(1.0, rel=1e-3)
-    assert weights[-1] / weights[0] == pytest.approx(np.exp(3.0), rel=1e-5)
-    assert recency_weights(np.array([0.0, 1.0]), 0.0).tolist() == [1.0, 1.0]
+def test_what_is_newer_is_drawn_more_often() -> None:
+    events = np.random.rand(50, 2) < 0.2
+    windows = WindowIndex(events, 3, recency=3.0)
+    density = np.exp(3.0 * np.arange(48) / 48)[:, None] * np.ones(2)
+    density /= density.sum()
+    has_event = np.zeros((48, 2), dtype=bool)
+    for step, env in event_starts(events, 3):
+        has_event[step, env] = True
+    assert windows.event_share == pytest.approx(density[has_event].sum())
+    for draw, expected in ((windows.draw, density), (windows.draw_events, density * has_event / density[has_event].sum())):
+        counts = np.zeros((48, 2))
+        np.add.at(counts, tuple(draw(200_000)), 1)
+        assert (counts[expected == 0] == 0).all()
+        np.testing.assert_allclose(counts, 200_000 * expected, atol=5 * np.sqrt(200_000 * expected.max()))
 
 
 def test_time_to_event() -> None:

@@ -11,7 +11,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 from sb3_esad.common.checks import require
 from sb3_esad.common.cost_buffers import CostBuffer
 from sb3_esad.common.type_aliases import SequenceSamples
-from sb3_esad.common.windows import WindowIndex, event_weights, recency_weights, time_to_event
+from sb3_esad.common.windows import WindowIndex, event_weights, time_to_event
 
 
 class SequenceReplayBuffer(CostBuffer):
@@ -30,7 +30,8 @@ class SequenceReplayBuffer(CostBuffer):
 
     Crashes are rare, so ``event_fraction`` of a batch is drawn among the windows with a cost, as soon as there is one; the
     ``event_weights`` of the samples take the bias out again. Most crashes are those of random actions and of early policies,
-    and where a model does not see clearly it expects what is usual: by ``recency`` that is what is usual lately.
+    and where a model does not see clearly it expects what is usual: by ``recency`` what is newer is drawn more often
+    (docs/experiments.md, section 23).
 
     :param buffer_size: number of steps, all environments together
     :param observation_space: Box, Discrete, MultiDiscrete, MultiBinary or a Dict of these
@@ -39,7 +40,8 @@ class SequenceReplayBuffer(CostBuffer):
     :param n_envs: number of parallel environments
     :param sequence_length: T, steps of a window; fewer while the buffer is younger
     :param event_fraction: share of a batch drawn among windows with a cost, in [0, 1)
-    :param recency: logarithm of the weight of the newest window over that of the oldest, >= 0; 0 for equal weights
+    :param recency: logarithm of the newest window's probability over that of the oldest, in [0, 100]; 0 if all are equally
+        likely
     :param kwargs: see :class:`CostBuffer`
     :raises ValueError: if an argument cannot be honoured
     """
@@ -53,12 +55,12 @@ class SequenceReplayBuffer(CostBuffer):
         n_envs: int = 1,
         sequence_length: int = 32,
         event_fraction: float = 0.5,
-        recency: float = 0.0,
+        recency: float = 3.0,
         **kwargs: Any,
     ) -> None:
         super().__init__(buffer_size, observation_space, action_space, device, n_envs, **kwargs)
         _check(self.buffer_size, sequence_length, event_fraction)
-        require(recency >= 0, "recency", recency, "a number >= 0")
+        require(0 <= recency <= 100, "recency", recency, "a number from 0 to 100")
         self.sequence_length = sequence_length
         self.event_fraction = event_fraction
         self.recency = recency
@@ -104,15 +106,14 @@ class SequenceReplayBuffer(CostBuffer):
             raise ValueError("The replay buffer is empty; add steps before sampling.")
         length = min(self.sequence_length, self.size())
         if self._windows is None:
-            self._windows = WindowIndex(self._events_in_order(), length)
-        n_events = int(batch_size * self.event_fraction) if self._windows.n_event_windows else 0
+            self._windows = WindowIndex(self._events_in_order(), length, self.recency)
+        n_events = int(batch_size * self.event_fraction) if self._windows.event_share > 0 else 0
         drawn = self._windows.draw(batch_size - n_events), self._windows.draw_events(n_events)
         starts, envs = map(np.concatenate, zip(*drawn, strict=True))
-        recent = recency_weights(starts / max(self._windows.n_starts - 1, 1), self.recency)
         steps = starts[:, None] + np.arange(length)
         if self.full:
             steps = (steps + self.pos) % self.buffer_size
-        return self._get_sequences(steps, envs[:, None], n_events, recent, env)
+        return self._get_sequences(steps, envs[:, None], n_events, env)
 
     def latest_episode(
         self, length: int, env: VecNormalize | None = None
@@ -138,15 +139,11 @@ class SequenceReplayBuffer(CostBuffer):
         """(size, n_envs) bool, oldest step first; a young buffer is rolled once around."""
         return np.roll(self.costs[: self.size()] > 0, -self.pos, axis=0)
 
-    def _get_sequences(
-        self, steps: np.ndarray, envs: np.ndarray, n_events: int, recent: np.ndarray, env: VecNormalize | None
-    ) -> SequenceSamples:
+    def _get_sequences(self, steps: np.ndarray, envs: np.ndarray, n_events: int, env: VecNormalize | None) -> SequenceSamples:
         assert self._windows is not None
         costs = self.costs[steps, envs]
         events = costs > 0
-        weights = event_weights(
-            events.any(axis=1), n_events / len(steps), self._windows.n_windows, self._windows.n_event_windows
-        )
+        weights = event_weights(events.any(axis=1), n_events / len(steps), self._windows.event_share)
         observations, next_observations = self._read_observations(steps, envs, env)
         return SequenceSamples(
             observations=observations,
@@ -156,7 +153,7 @@ class SequenceReplayBuffer(CostBuffer):
             costs=self.to_torch(costs, copy=False),
             continues=self.to_torch(self._continues(steps, envs), copy=False),
             is_first=self.to_torch(self.episode_starts[steps, envs], copy=False),
-            event_weights=self.to_torch(recent * weights, copy=False),
+            event_weights=self.to_torch(weights, copy=False),
             uniform=self.to_torch(np.arange(len(steps)) < len(steps) - n_events, copy=False),
             time_to_event=self.to_torch(time_to_event(events, self._jumps(steps, envs)), copy=False),
         )

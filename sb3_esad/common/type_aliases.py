@@ -45,9 +45,8 @@ class SequenceSamples(NamedTuple):
     :param costs: (B, T), never normalised
     :param continues: (B, T), 0 where the step ended in a terminal state, 1 elsewhere (a time limit is not terminal)
     :param is_first: (B, T) bool, the observation opens an episode; False at a window start inside an episode
-    :param event_weights: (B,), corrects the over-representation of windows with a cost, and of what is old if the buffer has a
-        ``recency``; its expectation is 1
-    :param uniform: (B,) bool, the window was drawn uniformly and not for its cost
+    :param event_weights: (B,), corrects the over-representation of windows with a cost; its expectation is 1
+    :param uniform: (B,) bool, the window was drawn among all and not for its cost
     :param time_to_event: (B, T) int, steps until the next cost of the same episode and window; 0 if the step itself
         costs, ``NO_EVENT`` if there is none
     """

@@ -23,77 +23,79 @@ class WindowIndex:
     """
     All windows of one length, and those of them that hold a cost event.
 
+    What is newer is drawn more often: the probability of a window falls exponentially with its age.
+
     The starts whose window reaches the event at ``p`` are p - length + 1 ... p. Cut where the previous event of the same
-    environment reaches them too, these ranges are disjoint, so a uniform draw needs the events only, not all steps.
+    environment reaches them too, these ranges are disjoint, so a draw needs the events only, not all steps.
 
     :param events: (size, n_envs) bool, oldest step first
     :param length: steps in a window, at most ``size``
+    :param recency: >= 0, logarithm of the newest window's probability over that of the oldest; 0 if all are equally likely
     """
 
-    def __init__(self, events: np.ndarray, length: int) -> None:
+    def __init__(self, events: np.ndarray, length: int, recency: float = 0.0) -> None:
         size, self.n_envs = events.shape
         self.n_starts = size - length + 1
-        self._envs, steps = np.nonzero(events.T)
-        previous = np.where(np.diff(self._envs, prepend=-1) == 0, np.roll(steps, 1), -1)
-        self._first = np.maximum(steps - length, previous) + 1
-        self._first = np.maximum(self._first, 0)
-        counts = np.minimum(steps, self.n_starts - 1) - self._first + 1
-        self._ends = np.cumsum(np.maximum(counts, 0))
+        self.recency = recency
+        envs, steps = np.nonzero(events.T)
+        previous = np.where(np.diff(envs, prepend=-1) == 0, np.roll(steps, 1), -1)
+        first = np.maximum(np.maximum(steps - length, previous) + 1, 0)
+        end = np.minimum(steps + 1, self.n_starts)
+        some = first < end
+        self._envs, self._first, self._end = envs[some], first[some], end[some]
+        self._before = self._share_older(self._first)
+        self._cumulated = np.cumsum(self._share_older(self._end) - self._before)
 
     @property
-    def n_windows(self) -> int:
-        """Number of windows, all environments together."""
-        return self.n_starts * self.n_envs
-
-    @property
-    def n_event_windows(self) -> int:
-        """Number of windows with at least one event."""
-        return int(self._ends[-1]) if len(self._ends) else 0
+    def event_share(self) -> float:
+        """Probability that a window drawn among all holds an event."""
+        return float(self._cumulated[-1]) / self.n_envs if len(self._cumulated) else 0.0
 
     def draw(self, n: int) -> Starts:
         """
-        :param n: number of windows, all equally likely
+        :param n: number of windows
         :return: their starts
         """
-        return Starts(np.random.randint(self.n_starts, size=n), np.random.randint(self.n_envs, size=n))
+        steps = np.minimum(self._start_at(np.random.rand(n)), self.n_starts - 1)
+        return Starts(steps, np.random.randint(self.n_envs, size=n))
 
     def draw_events(self, n: int) -> Starts:
         """
-        :param n: number of windows with an event, all of these equally likely; there must be one unless ``n`` is 0
-        :return: their starts
+        :param n: number of windows with an event, as likely relative to each other as in :meth:`draw`
+        :return: their starts; none if there are no such windows
         """
-        ranks = np.random.randint(max(self.n_event_windows, 1), size=n)
-        ranges = np.searchsorted(self._ends, ranks, side="right")
-        offsets = ranks - np.concatenate([[0], self._ends])[ranges]
-        return Starts(self._first[ranges] + offsets, self._envs[ranges])
+        if len(self._cumulated) == 0:
+            n = 0
+        shares = np.random.rand(n) * (self._cumulated[-1] if n else 0.0)
+        ranges = np.searchsorted(self._cumulated, shares, side="right")
+        beyond = shares - np.concatenate([[0.0], self._cumulated])[ranges]
+        steps = self._start_at(self._before[ranges] + beyond)
+        return Starts(steps.clip(self._first[ranges], self._end[ranges] - 1), self._envs[ranges])
+
+    def _share_older(self, starts: np.ndarray) -> np.ndarray:
+        """Probability that a window begins before a start."""
+        places = starts / self.n_starts
+        return np.expm1(self.recency * places) / np.expm1(self.recency) if self.recency > 0 else places
+
+    def _start_at(self, shares: np.ndarray) -> np.ndarray:
+        """The start up to which windows have a share of the probability, the inverse of :meth:`_share_older`."""
+        places = np.log1p(shares * np.expm1(self.recency)) / self.recency if self.recency > 0 else shares
+        return (places * self.n_starts).astype(np.int64)
 
 
-def event_weights(has_event: np.ndarray, fraction: float, n_windows: int, n_event_windows: int) -> np.ndarray:
+def event_weights(has_event: np.ndarray, fraction: float, event_share: float) -> np.ndarray:
     """
-    Importance weights that make a batch with too many events unbiased: density of a uniform draw over the actual one.
+    Importance weights that make a batch with too many events unbiased: density of a draw among all over the actual one.
 
     :param has_event: (B,) bool, the window holds an event
     :param fraction: share of the batch that was drawn among the windows with an event, in [0, 1)
-    :param n_windows: number of all windows
-    :param n_event_windows: number of windows with an event
+    :param event_share: share of windows with an event in a draw among all
     :return: (B,) float32 weights of expectation 1
     """
     density = np.full(has_event.shape, 1.0 - fraction)
-    if n_event_windows > 0:
-        density[has_event] += fraction * n_windows / n_event_windows
+    if event_share > 0:
+        density[has_event] += fraction / event_share
     return (1.0 / density).astype(np.float32)
-
-
-def recency_weights(places: np.ndarray, recency: float) -> np.ndarray:
-    """
-    Importance weights by which what is newer counts for more: exponential in the age, of expectation 1 over all ages.
-
-    :param places: from 0 for the oldest to 1 for the newest, any shape
-    :param recency: >= 0, logarithm of the newest's weight over that of the oldest; 0 for equal weights
-    :return: float32, of the shape of ``places``
-    """
-    scale = recency / -np.expm1(-recency) if recency > 0 else 1.0
-    return (scale * np.exp(recency * (places - 1.0))).astype(np.float32)
 
 
 def time_to_event(events: np.ndarray, lasts: np.ndarray) -> np.ndarray:
