@@ -91,7 +91,7 @@ EXPERIMENTS = {
             "both": Arm("esad_lend", {}),
             "critics from imagination alone": Arm("esad_lend", {"replay_cost_critic_coef": 0.0}),
             "above all recorded windows": Arm("esad_lend", RECORDED),
-            "uniform windows": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0}}),
+            "no more costs than there were": Arm("esad_lend", {"replay_buffer_kwargs": {"event_fraction": 0.0}}),
         },
     ),
     "E9": Experiment(

@@ -137,7 +137,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, default=UNSEEN)
     parser.add_argument("--out", type=Path, default=Path("calibration.png"))
     args = parser.parse_args()
-    if args.imagined_coef > 0 and args.buffer is None:
+    if args.imagined_coef != 0 and args.buffer is None:
         parser.error(f"--imagined-coef is {args.imagined_coef}, but nothing is fitted: add --buffer")
     model = ESADLEND.load(args.model, device="cpu")
     if args.buffer is not None:

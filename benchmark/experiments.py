@@ -1,7 +1,8 @@
 """
 The experiments of docs/experiments.md by name: ``python benchmark/experiments.py E5 --seeds 0 1 2``.
 
-Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept.
+Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept,
+also where the code has changed since: move it away then.
 Those that imagine have the demo's budget: 20,000 steps, about a thousand updates. The table pools the last evaluation of all
 seeds: driving score with the interval over seeds, the rest over episodes. Costs in training are counted for each seed, and
 again from the step on at which all arms have begun to learn.

@@ -139,7 +139,7 @@ class Gauge:
         filtered = model.observe(samples, th.zeros_like(samples.is_first.T))
         state = filtered.states.map(lambda field: field[start])
         self.overlaps[0] += overlap(model.reconstruct(state)["observation"], images[start])
-        same = th.ones_like(samples.uniform)
+        same = th.ones_like(samples.among_all)
         for ahead in range(1, HORIZON + 1):
             same &= ~samples.is_first.T[start + ahead]
             state = model.rssm.imagine(state._replace(action=samples.actions[:, start + ahead]))

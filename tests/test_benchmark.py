@@ -2,7 +2,7 @@
 
 import json
 import re
-import subprocess
+import runpy
 import sys
 from pathlib import Path
 
@@ -21,9 +21,13 @@ SCRIPTS = sorted(
 
 
 @pytest.mark.parametrize("script", SCRIPTS, ids=lambda script: script.stem)
-def test_help(script: Path) -> None:
-    run = subprocess.run([sys.executable, script, "--help"], capture_output=True, text=True, check=True)
-    assert f"usage: {script.name}" in run.stdout
+def test_help(script: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.syspath_prepend(script.parent)
+    monkeypatch.setattr(sys, "argv", [str(script), "--help"])
+    with pytest.raises(SystemExit) as end:
+        runpy.run_path(str(script), run_name="__main__")
+    assert end.value.code == 0
+    assert f"usage: {script.name}" in capsys.readouterr().out
 
 
 def test_what_does_not_apply_is_told() -> None:

@@ -73,7 +73,7 @@ def test_windows_are_contiguous(n_envs: int, n_steps: int) -> None:
     samples = buffer.sample(256)
     check_windows(samples, length=min(10, n_steps))
     assert samples.actions.shape == (256, min(10, n_steps), 1)
-    assert samples.is_first.dtype == samples.uniform.dtype == th.bool
+    assert samples.is_first.dtype == samples.among_all.dtype == th.bool
     assert samples.time_to_event.dtype == th.int64
     newest = samples.rewards[:, -1].unique()
     if n_steps > 40:
@@ -196,12 +196,12 @@ def test_half_of_a_batch_has_events() -> None:
     costs = np.zeros((500, 1))
     add_costs(buffer, costs)
     samples = buffer.sample(16)
-    assert samples.uniform.all() and (samples.event_weights == 1).all() and (samples.time_to_event == NO_EVENT).all()
+    assert samples.among_all.all() and (samples.event_weights == 1).all() and (samples.time_to_event == NO_EVENT).all()
     assert buffer.continue_after_cost == 0.0
     costs[250] = 1
     add_costs(buffer, costs)
     samples = buffer.sample(16)
-    assert samples.uniform.tolist() == [True] * 8 + [False] * 8
+    assert samples.among_all.tolist() == [True] * 8 + [False] * 8
     assert samples.costs[8:].any(dim=1).all()
     assert buffer.continue_after_cost == 1.0
 
@@ -234,7 +234,7 @@ def test_weights_are_unbiased(fraction: float, recency: float) -> None:
     costs = (np.random.rand(200, 2) < np.linspace(0.03, 0.0, 200)[:, None]) * np.random.rand(200, 2)
     add_costs(buffer, costs)
     starts = np.lib.stride_tricks.sliding_window_view(costs, 8, axis=0).mean(axis=(1, 2))
-    expected = np.average(starts, weights=np.exp(recency * np.linspace(0.0, 1.0, len(starts))))
+    expected = np.average(starts, weights=np.exp(recency * np.arange(len(starts)) / len(starts)))
     weighted, weights = [], []
     for _ in range(2000):
         samples = buffer.sample(16)
@@ -259,6 +259,20 @@ def test_what_is_newer_is_drawn_more_often() -> None:
         np.add.at(counts, tuple(draw(200_000)), 1)
         assert (counts[expected == 0] == 0).all()
         np.testing.assert_allclose(counts, 200_000 * expected, atol=5 * np.sqrt(200_000 * expected.max()))
+
+
+def test_a_wrapped_buffer_knows_what_is_new() -> None:
+    buffer = make_buffer(make_env(), size=50, length=5, recency=20.0)
+    add_costs(buffer, np.zeros((127, 1)))
+    assert (buffer.sample(64).observations > 110).float().mean() > 0.9
+
+
+def test_another_recency_counts_at_once() -> None:
+    buffer = make_buffer(make_env(), size=200, length=5, recency=100.0)
+    add_costs(buffer, np.zeros((200, 1)))
+    assert (buffer.sample(64).observations > 150).all()
+    buffer.recency = 0.0
+    assert (buffer.sample(64).observations < 100).any()
 
 
 def test_time_to_event() -> None:
@@ -446,7 +460,7 @@ def test_search_for_events_is_fast_with_many_steps() -> None:
     seconds = []
     for _ in range(20):
         start = time.process_time()
-        WindowIndex(np.roll(events, -5, axis=0), 32).draw_events(8)
+        WindowIndex(np.roll(events, -5, axis=0), 32, recency=3.0).draw_events(8)
         seconds.append(time.process_time() - start)
     assert np.median(seconds) < 3e-3
 
@@ -459,6 +473,7 @@ def test_search_for_events_is_fast_with_many_steps() -> None:
         ({"length": 0}, "sequence_length is 0"),
         ({"event_fraction": 1.0}, "event_fraction is 1.0"),
         ({"recency": -1.0}, "recency is -1.0"),
+        ({"recency": 101.0}, "recency is 101.0"),
     ],
 )
 def test_refuses_what_it_cannot_do(kwargs: dict[str, Any], message: str) -> None:

@@ -58,9 +58,9 @@ SOLVED = {
     "town07": (12, 6.5),
     "town10": (12, 4.0),
     "course": (12, 1.9),
-    "course-1mps": (12, 1.8),
+    "course-1mps": (6, 1.8),
     "course-2mps": (12, 1.7),
-    "course-3mps": (12, 1.7),
+    "course-3mps": (6, 1.7),
 }
 """Episodes that are driven, and the least mean speed of the reference driver [m/s]."""
 IDS = [f"esad-{name}{suffix}-v0" for name in SCENARIOS for suffix in ("", "-vector", "-dict")]

@@ -89,7 +89,7 @@ def make_samples(space: spaces.Space, is_first: list[list[int]]) -> SequenceSamp
         continues=ones,
         is_first=th.tensor(is_first, dtype=th.bool),
         event_weights=th.ones(n),
-        uniform=th.ones(n, dtype=th.bool),
+        among_all=th.ones(n, dtype=th.bool),
         time_to_event=th.full((n, length), NO_EVENT),
     )
 
@@ -588,7 +588,7 @@ def drawn_starts(n: int, filtered: Filtered, **fields: Any) -> list[int]:
     length, windows = filtered.is_first.shape
     defaults: dict[str, Any] = {
         "is_first": th.zeros(windows, length, dtype=th.bool),
-        "uniform": th.ones(windows, dtype=th.bool),
+        "among_all": th.ones(windows, dtype=th.bool),
         "time_to_event": th.full((windows, length), NO_EVENT),
         "continues": th.ones(windows, length),
     }
@@ -601,8 +601,8 @@ def test_imagination_starts_from_settled_states_half_of_them_usual() -> None:
     filtered = make_filtered([[0] * 8] * 3, [[0] * 8, [0, 0, 0, 0, 1, 1, 0, 0], [0] * 8])
     time_to_event = th.full((3, 8), NO_EVENT)
     time_to_event[2] = th.arange(10, 2, -1)  # within reach of the horizon from its fourth state on
-    uniform = th.tensor([True, True, False])
-    chosen = drawn_starts(1000, filtered, uniform=uniform, time_to_event=time_to_event)
+    among_all = th.tensor([True, True, False])
+    chosen = drawn_starts(1000, filtered, among_all=among_all, time_to_event=time_to_event)
     usual, dangerous = chosen[:500], chosen[500:]
     assert SETTLING_STEPS == 3 and EVENT_HORIZON == 8
     assert set(usual) == {3, 4, 5, 6, 7, 103, 104, 107}
@@ -618,9 +618,9 @@ def test_imagination_starts_where_an_action_was_taken() -> None:
 
 def test_without_danger_all_starts_are_usual() -> None:
     filtered = make_filtered([[0] * 6] * 2, [[0] * 6] * 2)
-    uniform = th.tensor([True, False])
-    assert set(drawn_starts(401, filtered, uniform=uniform)) == {3, 4, 5}
-    assert len(drawn_starts(401, filtered, uniform=uniform)) == 401
+    among_all = th.tensor([True, False])
+    assert set(drawn_starts(401, filtered, among_all=among_all)) == {3, 4, 5}
+    assert len(drawn_starts(401, filtered, among_all=among_all)) == 401
 
 
 def test_any_start_is_better_than_none() -> None:

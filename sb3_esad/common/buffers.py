@@ -40,8 +40,8 @@ class SequenceReplayBuffer(CostBuffer):
     :param n_envs: number of parallel environments
     :param sequence_length: T, steps of a window; fewer while the buffer is younger
     :param event_fraction: share of a batch drawn among windows with a cost, in [0, 1)
-    :param recency: logarithm of the newest window's probability over that of the oldest, in [0, 100]; 0 if all are equally
-        likely
+    :param recency: in [0, 100]; the probability of a window grows by e to this power from the beginning of the buffer to its
+        end, 0 if all are equally likely
     :param kwargs: see :class:`CostBuffer`
     :raises ValueError: if an argument cannot be honoured
     """
@@ -78,6 +78,9 @@ class SequenceReplayBuffer(CostBuffer):
         self.event_fraction, self.recency = other.event_fraction, other.recency
         self._windows = None  # those drawn last were for the former length
 
+    def __getstate__(self) -> dict[str, Any]:
+        return {**super().__getstate__(), "_windows": None}
+
     def reset(self) -> None:
         """Forget everything."""
         super().reset()
@@ -104,16 +107,14 @@ class SequenceReplayBuffer(CostBuffer):
         """
         if self.size() == 0:
             raise ValueError("The replay buffer is empty; add steps before sampling.")
-        length = min(self.sequence_length, self.size())
-        if self._windows is None:
-            self._windows = WindowIndex(self._events_in_order(), length, self.recency)
-        n_events = int(batch_size * self.event_fraction) if self._windows.event_share > 0 else 0
-        drawn = self._windows.draw(batch_size - n_events), self._windows.draw_events(n_events)
+        windows = self._index(min(self.sequence_length, self.size()))
+        n_events = int(batch_size * self.event_fraction) if windows.event_share > 0 else 0
+        drawn = windows.draw(batch_size - n_events), windows.draw_events(n_events)
         starts, envs = map(np.concatenate, zip(*drawn, strict=True))
-        steps = starts[:, None] + np.arange(length)
+        steps = starts[:, None] + np.arange(windows.length)
         if self.full:
             steps = (steps + self.pos) % self.buffer_size
-        return self._get_sequences(steps, envs[:, None], n_events, env)
+        return self._get_sequences(steps, envs[:, None], n_events, windows.event_share, env)
 
     def latest_episode(
         self, length: int, env: VecNormalize | None = None
@@ -135,15 +136,23 @@ class SequenceReplayBuffer(CostBuffer):
         steps, envs = order[begin : min(end, begin + length)], np.array(env_index)
         return *self._read_observations(steps, envs, env), self.to_torch(self.actions[steps, envs], copy=False)
 
+    def _index(self, length: int) -> WindowIndex:
+        """The windows of that length; drawn from again and again, until there are new steps or other settings."""
+        known = self._windows
+        if known is None or (known.length, known.recency) != (length, self.recency):
+            known = self._windows = WindowIndex(self._events_in_order(), length, self.recency)
+        return known
+
     def _events_in_order(self) -> np.ndarray:
         """(size, n_envs) bool, oldest step first; a young buffer is rolled once around."""
         return np.roll(self.costs[: self.size()] > 0, -self.pos, axis=0)
 
-    def _get_sequences(self, steps: np.ndarray, envs: np.ndarray, n_events: int, env: VecNormalize | None) -> SequenceSamples:
-        assert self._windows is not None
+    def _get_sequences(
+        self, steps: np.ndarray, envs: np.ndarray, n_events: int, event_share: float, env: VecNormalize | None
+    ) -> SequenceSamples:
         costs = self.costs[steps, envs]
         events = costs > 0
-        weights = event_weights(events.any(axis=1), n_events / len(steps), self._windows.event_share)
+        weights = event_weights(events.any(axis=1), n_events / len(steps), event_share)
         observations, next_observations = self._read_observations(steps, envs, env)
         return SequenceSamples(
             observations=observations,
@@ -154,7 +163,7 @@ class SequenceReplayBuffer(CostBuffer):
             continues=self.to_torch(self._continues(steps, envs), copy=False),
             is_first=self.to_torch(self.episode_starts[steps, envs], copy=False),
             event_weights=self.to_torch(weights, copy=False),
-            uniform=self.to_torch(np.arange(len(steps)) < len(steps) - n_events, copy=False),
+            among_all=self.to_torch(np.arange(len(steps)) < len(steps) - n_events, copy=False),
             time_to_event=self.to_torch(time_to_event(events, self._jumps(steps, envs)), copy=False),
         )
 

@@ -13,15 +13,15 @@ EVENT_HORIZON = 8
 
 def choose_starts(samples: SequenceSamples, filtered: Filtered, n: int) -> LatentState:
     """
-    Draw half of the starts from uniformly drawn windows, half from shortly before a cost.
+    Draw half of the starts from windows that were drawn among all, half from shortly before a cost.
 
     :param samples: recorded windows
     :param filtered: their states
     :param n: number of starts
-    :return: n states, those from uniform windows first
+    :return: n states, those from the former first
     """
     eligible = filtered.settled(SETTLING_STEPS, samples.is_first.T)
-    usual = (eligible & samples.uniform).float().flatten()
+    usual = (eligible & samples.among_all).float().flatten()
     dangerous = (eligible & (samples.time_to_event.T < EVENT_HORIZON)).float().flatten()
     chosen = th.cat([_draw(usual, n // 2), _draw(dangerous if dangerous.any() else usual, n - n // 2)])
     return filtered.before.map(lambda field: field.flatten(0, 1)[chosen])

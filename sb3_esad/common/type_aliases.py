@@ -45,8 +45,9 @@ class SequenceSamples(NamedTuple):
     :param costs: (B, T), never normalised
     :param continues: (B, T), 0 where the step ended in a terminal state, 1 elsewhere (a time limit is not terminal)
     :param is_first: (B, T) bool, the observation opens an episode; False at a window start inside an episode
-    :param event_weights: (B,), corrects the over-representation of windows with a cost; its expectation is 1
-    :param uniform: (B,) bool, the window was drawn among all and not for its cost
+    :param event_weights: (B,), corrects the over-representation of windows with a cost, and not that of what is new; its
+        expectation is 1
+    :param among_all: (B,) bool, the window was drawn among all and not for its cost
     :param time_to_event: (B, T) int, steps until the next cost of the same episode and window; 0 if the step itself
         costs, ``NO_EVENT`` if there is none
     """
@@ -59,7 +60,7 @@ class SequenceSamples(NamedTuple):
     continues: th.Tensor
     is_first: th.Tensor
     event_weights: th.Tensor
-    uniform: th.Tensor
+    among_all: th.Tensor
     time_to_event: th.Tensor
 
 

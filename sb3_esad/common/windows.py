@@ -30,13 +30,13 @@ class WindowIndex:
 
     :param events: (size, n_envs) bool, oldest step first
     :param length: steps in a window, at most ``size``
-    :param recency: >= 0, logarithm of the newest window's probability over that of the oldest; 0 if all are equally likely
+    :param recency: >= 0; probabilities grow by e to this power from the oldest step to the newest, 0 if all are equal
     """
 
     def __init__(self, events: np.ndarray, length: int, recency: float = 0.0) -> None:
         size, self.n_envs = events.shape
         self.n_starts = size - length + 1
-        self.recency = recency
+        self.length, self.recency = length, recency
         envs, steps = np.nonzero(events.T)
         previous = np.where(np.diff(envs, prepend=-1) == 0, np.roll(steps, 1), -1)
         first = np.maximum(np.maximum(steps - length, previous) + 1, 0)

@@ -26,7 +26,7 @@ class Transitions(NamedTuple):
     :param next_grids: features of the states reached, of shape (N, C, H, W)
     :param next_actions: of the present policy, of shape (N, A)
     :param outcomes: reward, cost and continuation of the step, fields of shape (N,)
-    :param event_weights: correct the over-representation of costs and of what is old, of shape (N,)
+    :param event_weights: correct the over-representation of costs, of shape (N,)
     :param followed: whether the next step of the window goes on from the state reached, of shape (T, B)
     """
 
