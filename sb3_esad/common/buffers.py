@@ -76,15 +76,9 @@ class SequenceReplayBuffer(CostBuffer):
         assert isinstance(other, SequenceReplayBuffer)
         self.sequence_length = other.sequence_length
         self.event_fraction, self.recency = other.event_fraction, other.recency
-        self._windows = None  # those drawn last were for the former length
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_windows": None}
-
-    def reset(self) -> None:
-        """Forget everything."""
-        super().reset()
-        self._windows = None
 
     def add(self, *args: Any, **kwargs: Any) -> None:
         """

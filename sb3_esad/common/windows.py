@@ -44,12 +44,12 @@ class WindowIndex:
         some = first < end
         self._envs, self._first, self._end = envs[some], first[some], end[some]
         self._before = self._share_older(self._first)
-        self._cumulated = np.cumsum(self._share_older(self._end) - self._before)
+        self._cumulated = np.append(0.0, np.cumsum(self._share_older(self._end) - self._before))
 
     @property
     def event_share(self) -> float:
         """Probability that a window drawn among all holds an event."""
-        return float(self._cumulated[-1]) / self.n_envs if len(self._cumulated) else 0.0
+        return float(self._cumulated[-1]) / self.n_envs
 
     def draw(self, n: int) -> Starts:
         """
@@ -61,15 +61,12 @@ class WindowIndex:
 
     def draw_events(self, n: int) -> Starts:
         """
-        :param n: number of windows with an event, as likely relative to each other as in :meth:`draw`
-        :return: their starts; none if there are no such windows
+        :param n: number of windows with an event, as likely relative to each other as in :meth:`draw`; 0 if there are none
+        :return: their starts
         """
-        if len(self._cumulated) == 0:
-            n = 0
-        shares = np.random.rand(n) * (self._cumulated[-1] if n else 0.0)
-        ranges = np.searchsorted(self._cumulated, shares, side="right")
-        beyond = shares - np.concatenate([[0.0], self._cumulated])[ranges]
-        steps = self._start_at(self._before[ranges] + beyond)
+        shares = np.random.rand(n) * self._cumulated[-1]
+        ranges = np.searchsorted(self._cumulated, shares, side="right") - 1
+        steps = self._start_at(self._before[ranges] + shares - self._cumulated[ranges])
         return Starts(steps.clip(self._first[ranges], self._end[ranges] - 1), self._envs[ranges])
 
     def _share_older(self, starts: np.ndarray) -> np.ndarray:
