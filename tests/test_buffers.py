@@ -300,6 +300,20 @@ def test_continue_after_cost_counts_steps() -> None:
     assert buffer.continue_after_cost == 0.5
 
 
+def test_continue_after_cost_is_of_the_steps_that_are_left() -> None:
+    """Counted as steps come and are overwritten; by brute force, and from nothing after a reset."""
+    buffer = make_buffer(make_env(2), size=14, length=5)
+    random = np.random.default_rng(0)
+    for _ in range(3):
+        for _ in range(11):
+            add_costs(buffer, random.integers(0, 2, (1, 2)).astype(float), random.integers(0, 2, (1, 2)))
+            events = buffer.costs[: buffer.size()] > 0
+            left = 1 - buffer.dones[: buffer.size()][events]
+            assert buffer.continue_after_cost == (left.mean() if events.any() else 0.0)
+        buffer.reset()
+        assert buffer.continue_after_cost == 0.0
+
+
 def test_same_seed_same_samples(seed: int) -> None:
     env = make_env(2, episode_length=EPISODE)
     buffer = make_buffer(env, size=200)

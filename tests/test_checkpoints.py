@@ -267,6 +267,8 @@ def test_mistakes_are_named(tmp_path: Path) -> None:
         RunCheckpointCallback(0, tmp_path)
     with pytest.raises(ValueError, match="SAC cannot be resumed; use SB3's CheckpointCallback instead"):
         SAC("MlpPolicy", CountingEnv(), buffer_size=10).learn(10, RunCheckpointCallback(5, tmp_path))
+    with pytest.raises(ValueError, match="use_sde=True: gSDE draws before a run can be resumed; leave it False"):
+        WCSAC("MlpPolicy", CountingEnv(), **IDLE, use_sde=True).learn(10, RunCheckpointCallback(5, tmp_path))
 
 
 def test_what_a_killed_process_left_is_removed(tmp_path: Path) -> None:

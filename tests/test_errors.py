@@ -13,7 +13,7 @@ from stable_baselines3.common.envs import IdentityEnv
 from stable_baselines3.common.vec_env import DummyVecEnv
 from stable_baselines3.her import HerReplayBuffer
 
-from sb3_esad import ESADLEND
+from sb3_esad import ESADLEND, WCSAC, SACLag
 from sb3_esad.common.schedules import HoldThenFall
 from tests.conftest import PICTURE, SPACES, TINY, VECTOR, CountingEnv, RandomEnv
 
@@ -124,6 +124,29 @@ def test_arguments_of_the_world_model_out_of_range(name: str, value: Any) -> Non
     with pytest.raises(ValueError) as error:
         make_model(policy_kwargs={**TINY["policy_kwargs"], "world_model_kwargs": {name: value}})
     check_sentence(error, f"{name} is {value!r}", "choose")
+
+
+def test_a_barrier_that_looks_beyond_the_dream_would_never_be_seen() -> None:
+    with pytest.raises(ValueError) as error:
+        make_model(barrier_steps=3, barrier_coef=1.0)
+    check_sentence(error, "barrier_steps is 3", "imagination_horizon=3")
+    assert make_model(barrier_steps=3).barrier_steps == 3
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.uint8])
+def test_actions_that_are_no_floating_point(dtype: Any) -> None:
+    env = CountingEnv()
+    env.action_space = spaces.Box(0, 10, (1,), dtype)
+    with pytest.raises(ValueError) as error:
+        make_model(env=env)
+    check_sentence(error, "needs actions of floating point", np.dtype(dtype).name, "round in the environment")
+
+
+@pytest.mark.parametrize("algorithm", [ESADLEND, WCSAC, SACLag])
+def test_the_limit_does_not_take_the_place_of_another_argument(algorithm: Any) -> None:
+    """The fourth argument of SB3's SAC is buffer_size."""
+    with pytest.raises(TypeError, match="positional arguments"):
+        algorithm("MlpPolicy", CountingEnv(), 3e-4, 100_000)
 
 
 def test_risk_level_is_checked_without_a_limit_too() -> None:

@@ -581,6 +581,31 @@ def test_costs_of_episodes_are_logged() -> None:
     assert logged["rollout/cost_rate"] == pytest.approx(8 / 28)
 
 
+def test_a_line_of_the_log_is_the_mean_of_all_updates_since_the_last_one() -> None:
+    model = make_model().learn(24)
+    model.logger.dump(0)
+    for losses in ([1.0, 3.0], [8.0, 8.0]):
+        model._record({"critic_loss": losses})
+    assert model.logger.name_to_value["train/critic_loss"] == 5.0
+
+
+def test_the_networks_have_the_names_that_sac_gives_them(tmp_path: Path) -> None:
+    model = make_model()
+    model.save(tmp_path / "model")
+    for each in (model, ESADLEND.load(tmp_path / "model")):
+        assert each.actor is each.policy.actor
+        assert each.critic is each.policy.critic and each.critic_target is each.policy.critic_target
+
+
+def test_a_frozen_features_extractor_is_left_as_it_is() -> None:
+    model = make_model()
+    extractor = model.policy.world_model.features_extractor.requires_grad_(False)
+    before, others = [th.nn.utils.parameters_to_vector(part.parameters()) for part in (extractor, model.policy.world_model)]
+    model.learn(28)
+    after, changed = [th.nn.utils.parameters_to_vector(part.parameters()) for part in (extractor, model.policy.world_model)]
+    assert th.equal(before, after) and not th.equal(others, changed)
+
+
 def test_a_reset_from_outside_leaves_no_costs_behind() -> None:
     """Learning anew resets the environment in the midst of an episode, whose costs must not be added to the next."""
     model = make_model(learning_starts=0).learn(12)
@@ -645,6 +670,14 @@ def test_barrier_looks_some_steps_ahead() -> None:
     th.testing.assert_close(barrier[:3], barrier_residual(risk[2:], risk[:3], model.penalty.budget, 0.3))
     assert (barrier[3:] == 0).all()
     assert (model._barrier(risk[:1]) == 0).all()
+
+
+def test_a_violated_barrier_weighs_as_much_as_it_was_told_to() -> None:
+    model = make_model(barrier_coef=3.0, barrier_steps=2)
+    objective, risk = th.zeros(4), th.ones(4)
+    violated, scale = th.tensor([0.0, 0.0, 0.0, 0.02]), model.penalty.budget_scale
+    weight = model.penalty.base_weight + 3.0 * violated / scale
+    th.testing.assert_close(model.penalty.combine(objective, risk, violated), weight / (1 + weight.mean()))
 
 
 @pytest.mark.parametrize("probability", [0.0, 1.0])

@@ -333,6 +333,19 @@ def test_calibration_is_of_the_present() -> None:
     assert record.calibration(0.01) > 90
 
 
+def test_a_loaded_record_forgets_as_the_saved_one_does() -> None:
+    """Episodes of 8 environments are longer than ``road_steps``, and the window is longer, too."""
+    records = [EpisodeRecord(cost_gamma=0.5, episode_length=50, window=50, road_steps=100) for _ in range(2)]
+    for step in range(95):
+        records[0].observe(np.full(8, 1.0 * (step < 50)), np.full(8, step % 50 == 49))
+    records[1].load_state_dict(records[0].state_dict())
+    for record in records:
+        for _ in range(10):
+            record.note_prediction(th.ones(8))
+            record.observe(np.zeros(8), np.zeros(8, dtype=bool))
+    assert records[0].expected_cost == records[1].expected_cost > 0
+
+
 def test_another_number_of_environments() -> None:
     penalty = make_penalty()
     penalty.observe(np.ones(2), np.zeros(2, dtype=bool))

@@ -1,13 +1,15 @@
 """The last word on the action: a filter whose judgement is known, and the drive that it changes."""
 
+import copy
 import math
 import pickle
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import pytest
 import torch as th
+from stable_baselines3.common.noise import NormalActionNoise
 
 from sb3_esad import ADEND, ESADLEND
 from sb3_esad.common.agent import LatentAgent
@@ -23,7 +25,7 @@ BUDGET_SCALE = AugmentedLagrangian(cost_limit=0.05).budget_scale
 
 
 class Known(Foresight):
-    """An action a is worth a and as risky as (a - calm)^2, more in vague worlds; where it leads to nothing is at risk."""
+    """An action a is worth a and as risky as (a - calm)^2, more in vague worlds; where it leads to all is as before."""
 
     def __init__(self, calm: float) -> None:
         super().__init__(steps=1, gamma=0.9, cost_gamma=0.9, risk_level=0.5, barrier_decay=0.3)
@@ -31,7 +33,8 @@ class Known(Foresight):
 
     def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
         action = start.action[:, 0]
-        return Outlook(action, self.at(action) * start.memory[:, 0, 0, 0], th.zeros_like(action))
+        risks = self.at(action) * start.memory[:, 0, 0, 0]
+        return Outlook(action, risks, risks, risks)
 
     def at(self, action: th.Tensor) -> th.Tensor:
         return (action - self.calm).square()
@@ -50,9 +53,14 @@ def belief(agent: LatentAgent, n: int) -> Belief:
     return Belief(state._replace(memory=th.ones_like(state.memory)), th.zeros(n, 8, 1, 1))
 
 
-def make_filter(calm: float, active: bool = True, **settings: Any) -> SafetyFilter:
-    penalty = AugmentedLagrangian(cost_limit=0.05)
-    return SafetyFilter(penalty, lambda: active, Known(calm), risk_level=0.5, **settings)
+class Trusting(AugmentedLagrangian):
+    """Finds all critics calibrated."""
+
+    calibrated = True
+
+
+def make_filter(calm: float, cost_limit: float = 0.05, filter_start: int = 0, **settings: Any) -> SafetyFilter:
+    return SafetyFilter(Trusting(cost_limit), filter_start, Known(calm), risk_level=0.5, **settings)
 
 
 def test_what_is_admissible_is_executed_as_it_is(agent: LatentAgent) -> None:
@@ -60,6 +68,35 @@ def test_what_is_admissible_is_executed_as_it_is(agent: LatentAgent) -> None:
     selection = make_filter(calm=0.2).select(agent, belief(agent, 3), proposed)
     assert th.equal(selection.actions, proposed)
     assert not selection.intervened.any() and not selection.helpless.any()
+    th.testing.assert_close(selection.risks, Known(0.2).at(proposed[:, 0]))
+
+
+@pytest.mark.parametrize("cost_limit", [0.0, 0.05])
+def test_a_steady_risk_within_the_scale_of_the_budget_is_admissible(agent: LatentAgent, cost_limit: float) -> None:
+    """The barrier must not be stricter than the limit itself, which under a limit of 0 would refuse everything."""
+    safety = make_filter(calm=0.2, cost_limit=cost_limit)
+    scale = AugmentedLagrangian(cost_limit).budget_scale
+    proposed = 0.2 + th.tensor([[0.95], [1.05]]) * math.sqrt(scale)
+    assert safety.select(agent, belief(agent, 2), proposed).intervened.tolist() == [False, True]
+
+
+class Rising(Known):
+    """Little risk now, more of it soon."""
+
+    def __init__(self, soon: float) -> None:
+        super().__init__(calm=0.0)
+        self.soon = soon
+
+    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
+        little = th.full_like(start.action[:, 0], 0.5 * BUDGET_SCALE)
+        return Outlook(start.action[:, 0], little, little, th.full_like(little, self.soon * BUDGET_SCALE))
+
+
+@pytest.mark.parametrize(("soon", "refused"), [(0.6, False), (0.64, False), (0.66, True), (1.0, True)])
+def test_an_action_whose_risk_rises_too_fast_is_refused(agent: LatentAgent, soon: float, refused: bool) -> None:
+    """h = Gamma - d_s may move by .3 of its distance to 0: from .5 to .5 + .3 x .5 = .65."""
+    safety = SafetyFilter(Trusting(0.05), 0, Rising(soon), risk_level=0.5)
+    assert safety.select(agent, belief(agent, 3), th.zeros(3, 1)).helpless.tolist() == 3 * [refused]
 
 
 def test_only_what_is_not_admissible_is_replaced_by_the_best_that_is(agent: LatentAgent) -> None:
@@ -98,7 +135,7 @@ def test_where_nothing_is_admissible_the_least_risk_is_taken(agent: LatentAgent)
 
 @pytest.mark.parametrize(("risk_level", "expected"), [(0.25, 4.0), (0.5, 3.5), (0.6, 3.0), (1.0, 2.5)])
 def test_an_action_is_as_risky_as_in_its_worst_scenarios(agent: LatentAgent, risk_level: float, expected: float) -> None:
-    safety = SafetyFilter(AugmentedLagrangian(0.05), lambda: True, Known(0.0), risk_level, n_candidates=4)
+    safety = SafetyFilter(Trusting(0.05), 0, Known(0.0), risk_level, n_candidates=4)
     state = agent.world_model.initial(2).map(lambda field: field.expand(4, *field.shape))
     vague = th.tensor([[3.0, 1.0, 4.0, 2.0], [10.0, 20.0, 30.0, 40.0]]).T
     scenarios = state._replace(memory=state.memory + vague[..., None, None, None])
@@ -111,29 +148,30 @@ class Sided(Known):
 
     def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
         action = start.action[:, 0]
-        return Outlook(action, (action * start.memory[:, 0, 0, 0]).relu(), th.zeros_like(action))
+        risks = (action * start.memory[:, 0, 0, 0]).relu()
+        return Outlook(action, risks, risks, risks)
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return (actions[:, 0] * grids[:, 0, 0, 0]).relu()
 
 
 def test_each_action_has_its_own_worst_scenarios(agent: LatentAgent) -> None:
-    safety = SafetyFilter(AugmentedLagrangian(0.05), lambda: True, Sided(0.0), risk_level=0.5, n_candidates=4)
+    safety = SafetyFilter(Trusting(0.05), 0, Sided(0.0), risk_level=0.5, n_candidates=4)
     state = agent.world_model.initial(1).map(lambda field: field.expand(4, *field.shape))
     side = th.tensor([1.0, -1.0, 1.0, -1.0]).view(4, 1, 1, 1, 1)
     outlook = safety.assess(agent, state._replace(memory=state.memory + side), th.tensor([[[0.9]], [[-0.8]], [[0.0]]]))
     th.testing.assert_close(outlook.risks, th.tensor([[0.9], [0.8], [0.0]]))
 
 
-@pytest.mark.parametrize("passive", [NoFilter(), make_filter(calm=5.0, active=False)])
+@pytest.mark.parametrize("passive", [NoFilter(), make_filter(calm=5.0, filter_start=1)])
 def test_a_filter_that_is_not_to_be_trusted_changes_nothing(agent: LatentAgent, passive: ActionFilter) -> None:
     proposed = 2 * th.rand(4, 1) - 1
     selection = passive.select(agent, belief(agent, 4), proposed)
-    assert th.equal(selection.actions, proposed) and not selection.intervened.any()
+    assert th.equal(selection.actions, proposed) and not selection.intervened.any() and not selection.judged.any()
 
 
 def test_without_a_limit_everything_is_admissible(agent: LatentAgent) -> None:
-    safety = SafetyFilter(NoPenalty(), lambda: True, Known(5.0), risk_level=0.5)
+    safety = SafetyFilter(NoPenalty(), 0, Known(5.0), risk_level=0.5)
     proposed = 2 * th.rand(4, 1) - 1
     assert th.equal(safety.select(agent, belief(agent, 4), proposed).actions, proposed)
 
@@ -155,8 +193,10 @@ def test_foresight_is_what_model_and_critics_say(agent: LatentAgent, risk_level:
     _, variance = agent.cost_critic(agent.world_model.features(state), state.action)
     to_come = costs + 0.8 * continues * means.max(0).values
     th.testing.assert_close(outlook.risks, agent.cost_critic.risk(to_come[None], variance, risk_level))
-    th.testing.assert_close(outlook.next_risks, agent.cost_critic.risk(means, end_variance, risk_level))
-    expected = barrier_residual(outlook.next_risks, outlook.risks, 0.1, 0.3)
+    th.testing.assert_close(outlook.next_risks, continues * agent.cost_critic.risk(means, end_variance, risk_level))
+    means, _ = agent.cost_critic(agent.world_model.features(state), state.action)
+    th.testing.assert_close(outlook.critic_risks, agent.cost_critic.risk(means, variance, risk_level))
+    expected = barrier_residual(outlook.next_risks, outlook.critic_risks, 0.1, 0.3)
     th.testing.assert_close(foresight.barrier(outlook, 0.1), expected)
 
 
@@ -168,7 +208,7 @@ class Always(ActionFilter):
 
     def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
         replaced = th.ones(len(proposed), dtype=th.bool)
-        return Selection(th.full_like(proposed, 0.25), replaced, ~replaced)
+        return Selection(th.full_like(proposed, 0.25), replaced, ~replaced, th.zeros(len(proposed)))
 
 
 class Obstinate(ESADLEND):
@@ -181,7 +221,7 @@ def test_what_is_executed_is_stored_remembered_and_counted() -> None:
     assert (actions[:20] != 0.25).all() and (actions[20:] == 0.25).all()
     assert model._last_latent is not None and (model._last_latent.action == 0.25).all()
     assert model.predict(np.zeros(1, dtype=np.float32))[0] == 0.25
-    assert model._selections.take() == {"intervention_rate": 1.0, "fallback_rate": 0.0}
+    assert model._selections.take() == {"filter_rate": 1.0, "intervention_rate": 1.0, "fallback_rate": 0.0}
     assert model._selections.take() == {}
 
 
@@ -194,14 +234,42 @@ def test_nothing_is_filtered_without_a_limit_or_a_filter() -> None:
         assert isinstance(model.policy.action_filter, NoFilter)
 
 
-def test_the_filter_waits_for_updates_and_for_critics_that_can_be_trusted() -> None:
-    model = ESADLEND("MlpPolicy", CountingEnv(), **TINY, filter_start=5)
-    model.penalty = NoPenalty()  # always calibrated
-    assert not model._filter_is_active()
-    model._n_updates = 5
-    assert model._filter_is_active()
-    model.penalty = AugmentedLagrangian(0.05)
-    assert not model._filter_is_active()
+class Proposing(Always):
+    """Executes what is proposed, and remembers it."""
+
+    seen: ClassVar[list[float]] = []
+
+    def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
+        self.seen.append(proposed.item())
+        return NoFilter().select(agent, belief, proposed)
+
+
+class Noticing(ESADLEND):
+    filter_class = Proposing
+
+
+def test_noise_is_added_before_the_filter() -> None:
+    """Or it would make an admissible action one that is not."""
+    noise = NormalActionNoise(np.full(1, 5.0), np.zeros(1))
+    Proposing.seen.clear()
+    Noticing("MlpPolicy", CountingEnv(), **TINY, filter_start=0, action_noise=noise).learn(30)
+    assert len(Proposing.seen) >= 10 and set(Proposing.seen) == {1.0}
+
+
+def test_the_filter_waits_for_updates_and_for_critics_that_can_be_trusted(agent: LatentAgent) -> None:
+    penalty = Trusting(0.05)
+    safety = SafetyFilter(penalty, 5, Known(5.0), risk_level=0.5)
+    for updates, calibrated, active in ((4, True, False), (5, True, True), (5, False, False)):
+        penalty.n_updates.fill_(updates)
+        penalty.calibrated = calibrated
+        assert safety.select(agent, belief(agent, 1), th.zeros(1, 1)).judged.item() == active
+
+
+def test_a_copy_of_the_policy_leaves_the_algorithm_alone() -> None:
+    model = ESADLEND("MlpPolicy", CountingEnv(), **TINY, filter_start=0)
+    copied: dict[int, Any] = {}
+    copy.deepcopy(model.policy, copied)
+    assert id(model.policy.action_filter) in copied and id(model) not in copied
 
 
 def test_predictions_by_a_filter_are_the_same_again_and_after_loading(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -218,14 +286,17 @@ def test_predictions_by_a_filter_are_the_same_again_and_after_loading(tmp_path: 
     agent, starts = model.policy.average, th.ones(5, dtype=th.bool)
     seen = agent.observe(th.as_tensor(observations), model.policy.initial_state(5), starts, True)
     assert not np.allclose(first, agent.act(seen.state, True).numpy()), "the filter has not intervened"
+    alone = [model.predict(observation, deterministic=True)[0] for observation in observations]
+    np.testing.assert_allclose(first, np.stack(alone), rtol=1e-5)
 
 
 def test_rates_are_shares_of_all_actions_and_take_no_more_room_the_longer_they_are_noted() -> None:
     rates, sizes = SelectionRates(), []
     intervened, helpless = th.tensor([True, True, False, False]), th.tensor([True, False, False, False])
+    risks = th.tensor([0.1, 0.1, 0.0, math.nan])
     for _ in range(2):
         for _ in range(100):
-            rates.note(Selection(th.zeros(4, 1), intervened, helpless))
+            rates.note(Selection(th.zeros(4, 1), intervened, helpless, risks))
         sizes.append(len(pickle.dumps(rates)))
     assert sizes[0] == sizes[1]
-    assert rates.take() == {"intervention_rate": 0.5, "fallback_rate": 0.25}
+    assert rates.take() == {"filter_rate": 0.75, "intervention_rate": 0.5, "fallback_rate": 0.25}

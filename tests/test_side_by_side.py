@@ -9,6 +9,7 @@ import torch as th
 
 from sb3_esad import ESADLEND
 from sb3_esad.common import latent_algorithm
+from sb3_esad.common.diffusion import DiffusionHead
 from sb3_esad.common.side_by_side import side_by_side
 from tests.conftest import TINY, CountingEnv
 
@@ -58,13 +59,18 @@ def one_after_the_other(first: Callable[[], Any], second: Callable[[], Any], dev
     return outcomes
 
 
+@pytest.mark.parametrize("diffusion_steps", [0, 2])
 def test_the_model_is_fitted_while_the_behaviour_learns_as_if_it_came_after(
-    two_threads: None, monkeypatch: pytest.MonkeyPatch
+    diffusion_steps: int, two_threads: None, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Dreams refined by diffusion, too: what is found about residuals must wait until they have been drawn."""
+    monkeypatch.setattr(DiffusionHead, "refines", True)
+    policy_kwargs = {**TINY["policy_kwargs"], "head_kwargs": {"diffusion_steps": diffusion_steps}}
+    settings = {**TINY, "policy_kwargs": policy_kwargs, "train_freq": 8, "gradient_steps": 3, "seed": 1}
     weights = []
     for jobs in (side_by_side, one_after_the_other):
         monkeypatch.setattr(latent_algorithm, "side_by_side", jobs)
-        model = ESADLEND("MlpPolicy", CountingEnv(), **{**TINY, "train_freq": 8, "gradient_steps": 3, "seed": 1}).learn(48)
+        model = ESADLEND("MlpPolicy", CountingEnv(), **settings).learn(48)
         weights.append(th.nn.utils.parameters_to_vector(model.policy.parameters()))
     assert th.equal(*weights)
 

@@ -2,10 +2,19 @@
 
 import torch as th
 from stable_baselines3.common.distributions import SquashedDiagGaussianDistribution
+from torch.distributions import Normal
 
 from sb3_esad.common.torch_layers import GridReadout, GridShape, LearningModule, mlp
 
 LOG_STD_MIN, LOG_STD_MAX = -3.0, 1.0
+
+
+class SquashedGaussian(SquashedDiagGaussianDistribution):
+    """SB3's distribution without torch's checks of parameters, for which a GPU would be waited for at each imagined step."""
+
+    def proba_distribution(self, mean_actions: th.Tensor, log_std: th.Tensor) -> "SquashedGaussian":
+        self.distribution = Normal(mean_actions, log_std.exp(), validate_args=False)
+        return self
 
 
 class Actor(LearningModule):
@@ -42,8 +51,8 @@ class Actor(LearningModule):
         """
         return self._distribution().log_prob_from_params(*self._mean_log_std(grid))
 
-    def _distribution(self) -> SquashedDiagGaussianDistribution:
-        return SquashedDiagGaussianDistribution(self.action_dim)
+    def _distribution(self) -> SquashedGaussian:
+        return SquashedGaussian(self.action_dim)
 
     def _mean_log_std(self, grid: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         mean, spread = self.mean_log_std_net(self.readout(grid)).float().chunk(2, dim=1)

@@ -53,7 +53,7 @@ class SequenceReplayBuffer(CostBuffer):
         action_space: spaces.Space,
         device: th.device | str = "auto",
         n_envs: int = 1,
-        sequence_length: int = 32,
+        sequence_length: int = 16,
         event_fraction: float = 0.5,
         recency: float = 3.0,
         **kwargs: Any,

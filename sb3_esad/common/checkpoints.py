@@ -81,6 +81,10 @@ class RunCheckpointCallback(BaseCallback):
     def _init_callback(self) -> None:
         if not hasattr(self.model, "begin_anew"):
             raise ValueError(f"{type(self.model).__name__} cannot be resumed; use SB3's CheckpointCallback instead.")
+        if self.model.use_sde:
+            raise ValueError(
+                "use_sde=True: gSDE draws before a run can be resumed; leave it False, or use CheckpointCallback."
+            )
         for unfinished in self.save_path.glob(f".*.{CHECKPOINT}"):
             unfinished.unlink()  # of a process that was killed
 

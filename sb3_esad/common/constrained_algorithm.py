@@ -71,6 +71,9 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
         self._check_size("n_candidates", 1, LARGEST_CHOICE)
         self._check_size("n_proposals", CALMEST, LARGEST_CHOICE)
         self._check_size("barrier_steps", 1, LARGEST_CHOICE // self.n_candidates)
+        steps, horizon = self.barrier_steps, self.imagination_horizon
+        fits = self.barrier_coef == 0 or steps < horizon
+        require(fits, "barrier_steps", steps, f"fewer than imagination_horizon={horizon}, or no barrier_coef")
 
     def _check_size(self, name: str, least: int, most: int) -> None:
         size = getattr(self, name)
@@ -97,16 +100,12 @@ class ConstrainedLatentAlgorithm(CostLimitedAlgorithm, LatentAlgorithm):
         filter_class = NoFilter if self.cost_limit is None or self.filter_start is None else self.filter_class
         return filter_class(
             penalty=self.penalty,
-            is_active=self._filter_is_active,
+            filter_start=self.filter_start,
             foresight=Foresight(self.barrier_steps, self.gamma, self.discount_of_cost, self.risk_level, self.barrier_decay),
             risk_level=self.risk_level,
             n_candidates=self.n_candidates,
             n_proposals=self.n_proposals,
         )
-
-    def _filter_is_active(self) -> bool:
-        assert self.filter_start is not None
-        return self._n_updates >= self.filter_start and self.penalty.calibrated
 
     def _last_state(self) -> th.Tensor:
         assert self._last_latent is not None

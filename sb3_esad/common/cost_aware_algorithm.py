@@ -79,7 +79,7 @@ class CostAwareAlgorithm(WholeFiles):
         progress_bar: bool = False,
     ) -> SelfCostAware:
         """
-        Learn from the environment.
+        Learn from the environment; on a CPU with glibc the process keeps freed memory from then on.
 
         :param total_timesteps: number of environment steps
         :param callback: called at every step
@@ -177,10 +177,10 @@ class CostAwareAlgorithm(WholeFiles):
         super().dump_logs()
 
     def _record(self, logs: dict[str, list[float]]) -> None:
-        """Log the means of what the updates have brought."""
+        """Log the means of what the updates since the last line have brought."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in logs.items():
-            self.logger.record(key_of(name), float(np.mean(values)))
+            self.logger.record_mean(key_of(name), float(np.mean(values)))
 
     def _setup_learn(
         self,
@@ -190,7 +190,8 @@ class CostAwareAlgorithm(WholeFiles):
         *args: Any,
         **kwargs: Any,
     ) -> tuple[int, BaseCallback]:
-        keep_freed_memory()
+        if self.device.type == "cpu":
+            keep_freed_memory()
         progress, start = self._interrupted, self._num_timesteps_at_start
         if progress is not None:
             self.begin_anew(progress.seed)

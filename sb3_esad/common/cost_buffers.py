@@ -63,12 +63,13 @@ class CostBuffer(ReplayBuffer):
         self._frames = make_frame_store(self.buffer_size, n_envs, observation_space)
         self.observations = self._frames.frames
         shape = (self.buffer_size, n_envs)
-        self.actions = np.zeros((*shape, self.action_dim), dtype=self._maybe_cast_dtype(action_space.dtype))
+        self.actions = np.zeros((*shape, self.action_dim), dtype=np.float32)  # scaled, whatever the type of the space
         self.rewards = np.zeros(shape, dtype=np.float32)
         self.costs = np.zeros(shape, dtype=np.float32)
         self.dones = np.zeros(shape, dtype=np.float32)
         self.timeouts = np.zeros(shape, dtype=np.float32)
         self.episode_starts = np.zeros(shape, dtype=bool)
+        self._n_events = self._n_continued = 0.0
 
     def __getstate__(self) -> dict[str, Any]:
         # Rows that no step has reached yet are most of a young buffer, and would be written to each file
@@ -91,6 +92,8 @@ class CostBuffer(ReplayBuffer):
         """Forget everything."""
         super().reset()
         self._frames.clear()
+        self._n_events = self._n_continued = 0.0
+        self.costs[:] = 0.0
 
     def add(
         self,
@@ -115,6 +118,7 @@ class CostBuffer(ReplayBuffer):
         jumps = self._frames.add(self.pos, obs, next_obs)
         # The step before the very first one is zero, hence not done, but the first one is a jump.
         self.episode_starts[self.pos] = jumps | (self.dones[self.pos - 1] > 0)
+        self._count_events(-1)
         self.actions[self.pos] = np.reshape(action, (self.n_envs, self.action_dim))
         self.rewards[self.pos] = reward
         self.costs[self.pos] = costs
@@ -122,17 +126,22 @@ class CostBuffer(ReplayBuffer):
         if self.handle_timeout_termination:
             # Arrays of one entry as well, which SB3's extend() may be given
             self.timeouts[self.pos] = np.array([info.get("TimeLimit.truncated", False) for info in infos]).reshape(-1)
+        self._count_events(1)
         self.pos = (self.pos + 1) % self.buffer_size
         self.full = self.full or self.pos == 0
 
     @property
     def continue_after_cost(self) -> float:
         """How often an episode goes on after a step with a cost: a share of the stored steps, 0 if none has a cost."""
-        events = self.costs[: self.size()] > 0
-        continues = self._continues(slice(self.size()), slice(None))[events]
-        return float(continues.mean()) if len(continues) else 0.0
+        return self._n_continued / self._n_events if self._n_events else 0.0
 
-    def _continues(self, steps: np.ndarray | slice, envs: np.ndarray | slice) -> np.ndarray:
+    def _count_events(self, sign: int) -> None:
+        """Count the costs of the present row, or take them back before it is overwritten."""
+        events = self.costs[self.pos] > 0
+        self._n_events += sign * float(events.sum())
+        self._n_continued += sign * float(self._continues(self.pos, slice(None))[events].sum())
+
+    def _continues(self, steps: np.ndarray | int, envs: np.ndarray | slice) -> np.ndarray:
         return 1.0 - self.dones[steps, envs] * (1.0 - self.timeouts[steps, envs])
 
     def _jumps(self, steps: np.ndarray, envs: np.ndarray) -> np.ndarray:

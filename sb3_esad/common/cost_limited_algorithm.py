@@ -79,7 +79,7 @@ class CostLimitedAlgorithm(CostAwareAlgorithm):
 
     def _setup_model(self) -> None:
         super()._setup_model()
-        self.penalty = self._make_penalty().to(self.device)
+        self.penalty = self._make_penalty()  # on the CPU: single numbers, which are read at every step
         self._violations: list[th.Tensor] = []
         self.last_risk: th.Tensor | None = None
 

@@ -43,7 +43,7 @@ class Denoiser(nn.Module):
         super().__init__()
         kernel = kernel_size(memory_shape)
         self.memory_net = conv_block(memory_shape[0], channels, kernel)
-        self.embedding_net = SameConv2d(embedding_channels, channels, 1)
+        self.embedding_net = SameConv2d(embedding_channels, channels, 1, bias=False)  # zeros are no observation
         self.level_net = dense_block(1, channels)
         self.latent_net = SameConv2d(latent_channels, channels, kernel)
         self.blocks = nn.Sequential(ResidualBlock(channels), ChannelNorm(channels), nn.SiLU())

@@ -1,13 +1,14 @@
 """What a Gaussian cannot expect, such as a car that turns left or right: its prior refined by a few steps of diffusion."""
 
 import math
-from typing import Any
+from typing import Any, NamedTuple
 
 import torch as th
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.denoiser import Denoiser
-from sb3_esad.common.latents import Gaussian, GaussianHead
+from sb3_esad.common.latents import Gaussian, GaussianHead, LatentHead
+from sb3_esad.common.target_networks import make_target, update_target
 from sb3_esad.common.torch_layers import GridShape
 from sb3_esad.common.type_aliases import Logs
 
@@ -15,8 +16,8 @@ MOST_STEPS = 1000
 """Far more than a sample ever gains from."""
 LEVEL_RATIO = 0.4
 """Of each noise level to the one before."""
-MEMORY = 0.99
-"""Of the running averages, per update."""
+TAU = 0.01
+"""Share of an update in the running averages."""
 
 
 def noise_levels(start: float | th.Tensor, steps: int) -> list[th.Tensor]:
@@ -30,16 +31,35 @@ def noise_levels(start: float | th.Tensor, steps: int) -> list[th.Tensor]:
     return [th.as_tensor(start * LEVEL_RATIO**step) for step in range(steps)]
 
 
-def gaussian_denoiser(noisy: th.Tensor, level: th.Tensor, variance: th.Tensor) -> th.Tensor:
+def gaussian_denoiser(noisy: th.Tensor, level: th.Tensor, mean: th.Tensor, variance: th.Tensor) -> th.Tensor:
     """
-    Best estimate of a residual that is Gaussian around zero.
+    Best estimate of a residual that is Gaussian.
 
     :param noisy: residual plus noise, of shape (N, C, H, W)
     :param level: standard deviation of the noise
-    :param variance: of the residual, of the shape of ``noisy``
-    :return: the estimate, of the same shape
+    :param mean: of the residual, broadcastable to ``noisy``
+    :param variance: of the residual, likewise
+    :return: the estimate, of the shape of ``noisy``
     """
-    return variance / (variance + level**2) * noisy
+    return mean + variance / (variance + level**2) * (noisy - mean)
+
+
+class Gauges(NamedTuple):
+    """
+    What a batch says of the residual and of those who estimate it.
+
+    :param residual_scale: its root mean square
+    :param residual_mean: its mean in each cell, of shape (C, H, W)
+    :param residual_square: its mean square in each cell, of shape (C, H, W)
+    :param posterior_std: mean spread of the posterior, of shape (C, H, W)
+    :param advantage: share of the squared error of the best Gaussian estimate that the denoiser saves
+    """
+
+    residual_scale: th.Tensor
+    residual_mean: th.Tensor
+    residual_square: th.Tensor
+    posterior_std: th.Tensor
+    advantage: th.Tensor
 
 
 class DiffusionHead(GaussianHead):
@@ -49,10 +69,11 @@ class DiffusionHead(GaussianHead):
     The model learns the residual r = mu_q - mu_p from noisy copies of it (EDM, arXiv 2206.00364), as a function of the memory
     and, in half of the cases, of the observation. Samples of the prior start from the Gaussian's own, noised, and take
     ``diffusion_steps`` steps that end at the posterior's spread and not at zero: few steps from little noise are worth more
-    than few steps from pure noise (truncated diffusion). It is learned beside the Gaussians, which never see its gradient.
+    than few steps from pure noise (truncated diffusion). It is learned beside the Gaussians, which never see its gradient,
+    and sampled by its average over the last updates.
 
-    Until the denoiser foresees residuals better than the Gaussian's own optimal denoiser, the head samples as a
-    :class:`GaussianHead`; with 0 steps, the default until more has been shown to help, it is one.
+    Until the denoiser foresees residuals better than any that takes them for Gaussian, as the prior expects them or as they
+    usually are, the head samples as a :class:`GaussianHead`.
 
     :param memory_shape: shape of the memory (C, H, W)
     :param embedding_channels: channels of the observation's features
@@ -65,8 +86,11 @@ class DiffusionHead(GaussianHead):
     """
 
     residual_scale: th.Tensor
+    residual_mean: th.Tensor
+    residual_square: th.Tensor
     posterior_std: th.Tensor
     advantage: th.Tensor
+    _gauges: Gauges | None = None
 
     def __init__(
         self,
@@ -74,26 +98,30 @@ class DiffusionHead(GaussianHead):
         embedding_channels: int,
         latent_channels: int,
         hidden_channels: int,
-        diffusion_steps: int = 0,
+        diffusion_steps: int = 2,
         start_level: float = 3.0,
         **kwargs: Any,
     ) -> None:
         super().__init__(memory_shape, embedding_channels, latent_channels, hidden_channels, **kwargs)
-        few = f"a number of steps from 0, for a Gaussian latent, to {MOST_STEPS}"
-        require(0 <= diffusion_steps <= MOST_STEPS, "diffusion_steps", diffusion_steps, few)
+        few = f"a number of steps from 1 to {MOST_STEPS}, or 0 for a Gaussian latent"
+        require(1 <= diffusion_steps <= MOST_STEPS, "diffusion_steps", diffusion_steps, few)
         require(start_level > 0, "start_level", start_level, "a multiple > 0")
         self.diffusion_steps = diffusion_steps
         self.start_level = start_level
         with th.random.fork_rng(devices=[]):  # so that all other networks begin as they would without a denoiser
             self.denoiser = Denoiser(memory_shape, hidden_channels, latent_channels, hidden_channels)
+        self.average_denoiser = make_target(self.denoiser)
+        latent_shape = (latent_channels, *memory_shape[1:])
         self.register_buffer("residual_scale", th.tensor(0.1))
-        self.register_buffer("posterior_std", th.ones(latent_channels, *memory_shape[1:]))
+        self.register_buffer("residual_mean", th.zeros(latent_shape))
+        self.register_buffer("residual_square", th.full(latent_shape, 0.01))
+        self.register_buffer("posterior_std", th.ones(latent_shape))
         self.register_buffer("advantage", th.tensor(-1.0))
 
     @property
     def refines(self) -> bool:
         """Whether samples are refined: the denoiser has become better than a Gaussian."""
-        return self.diffusion_steps > 0 and bool(self.advantage > 0)
+        return bool(self.advantage > 0)
 
     def sample(
         self,
@@ -104,7 +132,7 @@ class DiffusionHead(GaussianHead):
     ) -> th.Tensor:
         if not self.refines:
             return super().sample(memory, embedding, n_candidates, generator)
-        prior, context = self.prior(memory), self.denoiser.context(memory, embedding)
+        prior, context = self.prior(memory), self.average_denoiser.context(memory, embedding)
         level = self.residual_scale * (self.start_level if embedding is None else 1.0)
         fields = (prior.mean, context, *self._noised(prior, memory, embedding, level))
         mean, context, centre, spread = (th.cat([field] * n_candidates) for field in fields)
@@ -125,7 +153,7 @@ class DiffusionHead(GaussianHead):
         """Euler's steps from one noise level to the next; the last one ends at the spread of the posterior."""
         levels = noise_levels(start, self.diffusion_steps)
         for level, following in zip(levels, [*levels[1:], self.posterior_std], strict=True):
-            clean = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
+            clean = self.average_denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
             noisy = clean + (following / level).clamp(max=1) * (noisy - clean)
         # Where latents are vaguer than where the last step began
         missing = (self.posterior_std.square() - levels[-1].square()).clamp(min=0).sqrt()
@@ -140,16 +168,21 @@ class DiffusionHead(GaussianHead):
         generator: th.Generator | None = None,
     ) -> tuple[th.Tensor, Logs]:
         loss, logs = super().loss(posterior, prior, memory, embedding, generator)
-        if self.diffusion_steps == 0:
-            return loss, logs
         posterior, prior = (Gaussian(*(field.detach().flatten(end_dim=-4) for field in each)) for each in (posterior, prior))
         memory, embedding = (field.detach().flatten(end_dim=-4) for field in (memory, embedding))
         residual = posterior.mean - prior.mean
-        self._follow(posterior, residual)
-        self._judge(prior, residual, memory, generator)
+        self._gauges = self._gauge(posterior, prior, residual, memory, generator)
         diffusion = self._denoising_loss(residual, memory, embedding, generator)
         scales = {"residual_scale": self.residual_scale.item(), "diffusion_advantage": self.advantage.item()}
         return loss + diffusion, {**logs, "diffusion_loss": diffusion.item(), **scales}
+
+    def settle(self) -> None:
+        if self._gauges is None:
+            return
+        for name, value in self._gauges._asdict().items():
+            getattr(self, name).lerp_(value, TAU)
+        self._gauges = None
+        update_target(self.denoiser, self.average_denoiser, TAU)
 
     def _denoising_loss(
         self, residual: th.Tensor, memory: th.Tensor, embedding: th.Tensor, generator: th.Generator | None
@@ -166,18 +199,42 @@ class DiffusionHead(GaussianHead):
         return (weight * error.square().mean((-3, -2, -1))).mean()
 
     @th.no_grad()
-    def _follow(self, posterior: Gaussian, residual: th.Tensor) -> None:
-        """Move the running averages of sigma_d and sigma_q."""
-        self.residual_scale.lerp_(residual.square().mean().sqrt(), 1 - MEMORY)
-        self.posterior_std.lerp_(posterior.std.mean(0), 1 - MEMORY)
-
-    @th.no_grad()
-    def _judge(self, prior: Gaussian, residual: th.Tensor, memory: th.Tensor, generator: th.Generator | None) -> None:
-        """Compare the denoiser with the Gaussian's own where samples start, before it is fitted to these states."""
+    def _gauge(
+        self, posterior: Gaussian, prior: Gaussian, residual: th.Tensor, memory: th.Tensor, generator: th.Generator | None
+    ) -> Gauges:
+        """Compare the denoiser with Gaussian ones where samples start, before it is fitted to these states."""
         level = self.residual_scale * self.start_level
         noisy = Gaussian(residual, level.expand_as(residual)).sample(generator)
-        context = self.denoiser.context(memory, None)
-        learned = self.denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
-        assumed = gaussian_denoiser(noisy, level, self._residual_variance(prior))
-        errors = [(estimate - residual).square().mean() for estimate in (learned, assumed)]
-        self.advantage.lerp_(1 - errors[0] / errors[1], 1 - MEMORY)
+        context = self.average_denoiser.context(memory, None)
+        learned = self.average_denoiser(noisy, level.expand(len(noisy)), self.residual_scale, context)
+        # While the prior is not fitted its variance is wrong, and whatever is learned would look better
+        usual = self.residual_mean, self.residual_square - self.residual_mean.square()
+        rivals = (th.zeros_like(residual), self._residual_variance(prior)), usual
+        estimates = learned, *(gaussian_denoiser(noisy, level, *moments) for moments in rivals)
+        error, *others = ((estimate - residual).square().mean() for estimate in estimates)
+        square = residual.square().mean(0)
+        advantage = 1 - error / th.stack(others).min()
+        return Gauges(square.mean().sqrt(), residual.mean(0), square, posterior.std.mean(0), advantage)
+
+
+def make_head(
+    memory_shape: GridShape,
+    embedding_channels: int,
+    latent_channels: int,
+    hidden_channels: int,
+    diffusion_steps: int = 0,
+    **kwargs: Any,
+) -> LatentHead:
+    """
+    Build the latent head of ESAD-LEND: Gaussian, until more has been shown to help (docs/experiments.md, section 17).
+
+    :param memory_shape: shape of the memory (C, H, W)
+    :param embedding_channels: channels of the observation's features
+    :param latent_channels: channels of the latent
+    :param hidden_channels: units of the hidden layers in each cell
+    :param diffusion_steps: K, steps of a sample; 0 for a Gaussian latent
+    :param kwargs: see :class:`GaussianHead` and :class:`DiffusionHead`
+    :return: the head
+    """
+    sizes = (memory_shape, embedding_channels, latent_channels, hidden_channels)
+    return DiffusionHead(*sizes, diffusion_steps, **kwargs) if diffusion_steps else GaussianHead(*sizes, **kwargs)

@@ -19,7 +19,9 @@ class EntropyCoefficient(nn.Module, ABC):
     @abstractmethod
     def forward(self) -> th.Tensor:
         """
-        :return: the coefficient, without gradient
+        Give the coefficient.
+
+        :return: scalar, without gradient
         """
 
     @abstractmethod

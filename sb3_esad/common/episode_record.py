@@ -67,7 +67,7 @@ class EpisodeRecord(nn.Module):
         if len(costs) != len(self._whole):
             self._whole = np.ones(len(costs), dtype=bool)
         # Environments in step with each other would else show many steps of the same part of an episode
-        self.recent.steps = max(self.road_steps, math.ceil(2 * self._steps_of_episodes))
+        self.recent.length.fill_(max(self.road_steps, math.ceil(2 * self._steps_of_episodes)))
         # A cost counts in the discounted cost to come of every earlier step of its episode: 1 + gamma + gamma^2 + ...
         self._weights = 1.0 + self.cost_gamma * self._weights
         self.recent.add(len(costs), costs=costs.sum(), costs_to_come=(self._weights * costs).sum())

@@ -12,15 +12,17 @@ from sb3_esad.common.type_aliases import LatentState
 
 class Outlook(NamedTuple):
     """
-    What is expected of actions.
+    What is expected of actions, fields of the same shape.
 
     :param values: return to come
-    :param risks: Gamma, the conditional value at risk of the cost to come
-    :param next_risks: Gamma where they lead to in m steps
+    :param risks: Gamma, the conditional value at risk of the cost to come, as imagined
+    :param critic_risks: the same as the critics see it at once
+    :param next_risks: as they see it where the actions lead to in m steps, 0 where an episode is over by then
     """
 
     values: th.Tensor
     risks: th.Tensor
+    critic_risks: th.Tensor
     next_risks: th.Tensor
 
 
@@ -59,11 +61,11 @@ class Foresight:
         # Beginning and end at once: for so few states it is the number of calls that takes time
         begin_and_end = imagined.grids[[0, -1]].flatten(0, 1), imagined.actions[[0, -1]].flatten(0, 1)
         means, variances = agent.cost_critic(*begin_and_end)
-        end_costs, (variance, end_variance) = means.chunk(2, 1)[1], variances.chunk(2)
+        critic_risks, end_risks = agent.cost_critic.risk(means, variances, self.risk_level).chunk(2)
         values = _sum_up(rewards, continues, agent.critic(*ends).min(0).values, self.gamma)
-        cost_to_come = _sum_up(costs, continues, end_costs.max(0).values, self.cost_gamma)
-        risks = agent.cost_critic.risk(cost_to_come[None], variance, self.risk_level)
-        return Outlook(values, risks, agent.cost_critic.risk(end_costs, end_variance, self.risk_level))
+        cost_to_come = _sum_up(costs, continues, means.chunk(2, 1)[1].max(0).values, self.cost_gamma)
+        risks = agent.cost_critic.risk(cost_to_come[None], variances.chunk(2)[0], self.risk_level)
+        return Outlook(values, risks, critic_risks, continues.prod(0) * end_risks)
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """
@@ -79,13 +81,13 @@ class Foresight:
 
     def barrier(self, outlook: Outlook, budget: float) -> th.Tensor:
         """
-        By how much the barrier condition is violated.
+        By how much the barrier condition is violated, by what critics see at both ends: what is imagined differs from it.
 
         :param outlook: of actions
         :param budget: d, the discounted budget
         :return: residual, <= 0 where the condition holds, of the shape of its fields
         """
-        return barrier_residual(outlook.next_risks, outlook.risks, budget, self.barrier_decay)
+        return barrier_residual(outlook.next_risks, outlook.critic_risks, budget, self.barrier_decay)
 
 
 def _sum_up(amounts: th.Tensor, continues: th.Tensor, end: th.Tensor, gamma: float) -> th.Tensor:

@@ -75,6 +75,8 @@ class FrameStore:
 
     def get(self, steps: np.ndarray, envs: np.ndarray) -> np.ndarray:
         """
+        Read the frames in which steps were taken.
+
         :param steps: indices in the ring, of any shape S
         :param envs: broadcastable to S
         :return: (*S, ...) frames
@@ -83,10 +85,12 @@ class FrameStore:
 
     def get_next(self, steps: np.ndarray, envs: np.ndarray, jumps: np.ndarray) -> np.ndarray:
         """
+        Read the frames that steps have led to.
+
         :param steps: indices in the ring, of any shape S
         :param envs: broadcastable to S
         :param jumps: bool, of shape S, the frame after the step opens another episode
-        :return: (*S, ...) frames that the steps have led to
+        :return: (*S, ...) frames
         """
         envs = np.broadcast_to(envs, steps.shape)
         following = self.frames[(steps + 1) % len(self.frames), envs]

@@ -12,6 +12,7 @@ from stable_baselines3.common.type_aliases import GymEnv, Schedule
 
 from sb3_esad.common.checks import require
 from sb3_esad.common.log_keys import grouped
+from sb3_esad.common.optimizers import differentiate
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.recurrent_algorithm import RecurrentOffPolicyAlgorithm
@@ -74,6 +75,10 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         if _init_setup_model:
             self._setup_model()
 
+    def _setup_model(self) -> None:
+        super()._setup_model()
+        self.actor, self.critic, self.critic_target = self.policy.actor, self.policy.critic, self.policy.critic_target
+
     def _check_arguments(self) -> None:
         super()._check_arguments()
         require(0 <= self.lambda_return <= 1, "lambda_return", self.lambda_return, "a number in [0, 1]")
@@ -117,7 +122,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
             following = self._sample(batch_size)
             learn, fit = partial(self._learn_behavior, samples, filtered), self._fitting(following)
             behavior_logs, (next_filtered, next_logs) = side_by_side(learn, fit, self.device)
-            next_logs["world_model/grad_norm"] = self._move("world_model")
+            next_logs["world_model/grad_norm"] = self._move_world_model()
             yield {**model_logs, **behavior_logs}
             samples, filtered, model_logs = following, next_filtered, next_logs
         yield {**model_logs, **self._learn_behavior(samples, filtered)}
@@ -142,7 +147,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
 
     def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
         filtered, logs = self._fitting(samples)()
-        logs["world_model/grad_norm"] = self._move("world_model")
+        logs["world_model/grad_norm"] = self._move_world_model()
         return filtered, logs
 
     def _fitting(self, samples: SequenceSamples) -> Callable[[], tuple[Filtered, Logs]]:
@@ -152,20 +157,15 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         def fit() -> tuple[Filtered, Logs]:
             with autocast(self.device):
                 loss, filtered, logs = self.policy.world_model.loss(samples, generator)
-            self._differentiate("world_model", loss)
+            differentiate(loss, self.policy.world_model.optimizer)
             return filtered.detach(), grouped("world_model", logs)
 
         return fit
 
     def _step(self, name: str, loss: th.Tensor) -> float:
         """Minimise a loss by one step of one network; whatever else it passed through stays."""
-        self._differentiate(name, loss)
+        differentiate(loss, getattr(self.policy, name).optimizer)
         return self._move(name)
-
-    def _differentiate(self, name: str, loss: th.Tensor) -> None:
-        network = getattr(self.policy, name)
-        network.optimizer.zero_grad()
-        loss.backward(inputs=list(network.parameters()))
 
     def _move(self, name: str) -> float:
         """Move a network against its gradient, and its target after it."""
@@ -183,9 +183,17 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _first_actions(self, start: LatentState) -> th.Tensor:
         return self.policy.actor(self.policy.world_model.features(start))
 
+    def _move_world_model(self) -> float:
+        norm = self._move("world_model")
+        self.policy.world_model.rssm.head.settle()
+        return norm
+
     def _optimizers(self) -> dict[str, th.optim.Optimizer]:
         names = ("world_model", "actor", "critic", "cost_critic")
         return {f"policy.{name}.optimizer": getattr(self.policy, name).optimizer for name in names}
 
     def _get_torch_save_params(self) -> tuple[list[str], list[str]]:
         return ["policy", *self._optimizers()], []
+
+    def _excluded_save_params(self) -> list[str]:
+        return [*super()._excluded_save_params(), "actor", "critic", "critic_target"]

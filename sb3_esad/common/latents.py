@@ -124,6 +124,13 @@ class LatentHead(nn.Module, ABC):
         :return: scalar loss, and what to log
         """
 
+    def settle(self) -> None:
+        """
+        Take over what :meth:`loss` has found about scales, once the network has been moved.
+
+        Not in ``loss`` itself: that may be computed while another thread draws samples (:meth:`LatentAlgorithm.train`).
+        """
+
 
 class GaussianHead(LatentHead):
     """

@@ -116,6 +116,9 @@ class AugmentedLagrangian(Penalty):
         low, high = self.calibration_band
         return self._enough_episodes and self.episodes.has_prediction and low <= self.calibration <= high
 
+    def trusts_critics(self, n_updates: int) -> bool:
+        return bool(self.n_updates >= n_updates) and self.calibrated
+
     @property
     def _enough_episodes(self) -> bool:
         return self.episodes.size >= self.min_episodes

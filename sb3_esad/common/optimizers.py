@@ -109,6 +109,18 @@ class MuonWithAdam(th.optim.Optimizer):
         return {**super().__getstate__(), "matrices": self.matrices, "flat": self.flat, "parts": self.parts}
 
 
+def differentiate(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
+    """
+    Compute the gradient of a loss for the parameters of one network; whatever else it passed through, or is frozen, has none.
+
+    :param loss: scalar
+    :param optimizer: of the network
+    """
+    optimizer.zero_grad()
+    parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
+    loss.backward(inputs=[parameter for parameter in parameters if parameter.requires_grad])
+
+
 def refuse_misshapen_state(optimizer: th.optim.Optimizer) -> None:
     """
     Refuse, and forget, averages that are not of the shape of their parameter: torch's fused kernels write beyond their end.

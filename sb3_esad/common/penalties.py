@@ -36,19 +36,20 @@ class Penalty(nn.Module, ABC):
     def budget_scale(self) -> float:
         """d_s > 0, by which violations are normalised."""
 
-    @property
     @abstractmethod
-    def calibration(self) -> float:
-        """Predicted over observed discounted cost to come."""
+    def trusts_critics(self, n_updates: int) -> bool:
+        """
+        Tell whether what the critics expect may decide about actions.
 
-    @property
-    @abstractmethod
-    def calibrated(self) -> bool:
-        """Whether the predictions may be trusted."""
+        :param n_updates: before which it may not
+        :return: whether there have been as many, and predictions come true
+        """
 
     @abstractmethod
     def forward(self, violation: th.Tensor) -> th.Tensor:
         """
+        Penalise a violation; :meth:`combine` weighs risks by the derivative of this.
+
         :param violation: Gamma - d, <= 0 where the limit is kept
         :return: psi, the penalty of the violation, of the same shape
         """
@@ -56,6 +57,8 @@ class Penalty(nn.Module, ABC):
     @abstractmethod
     def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
         """
+        Weigh the risk of each imagined step beside what the actor wants.
+
         :param objective: what the actor minimises apart from safety
         :param risk: Gamma of each imagined step, of the same shape
         :param barrier: residual of the barrier condition, of the same shape
@@ -65,6 +68,8 @@ class Penalty(nn.Module, ABC):
     @abstractmethod
     def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
         """
+        Tell which actions may be executed.
+
         :param risk: estimated Gamma of candidate actions
         :param barrier: residual of the barrier condition, of the same shape
         :return: bool, whether each candidate may be executed
@@ -120,11 +125,12 @@ class NoPenalty(Penalty):
 
     budget = 0.0
     budget_scale = 1.0
-    calibration = 1.0
-    calibrated = True
 
     def __init__(self, **settings: Any) -> None:
         super().__init__()
+
+    def trusts_critics(self, n_updates: int) -> bool:
+        return True
 
     def forward(self, violation: th.Tensor) -> th.Tensor:
         return th.zeros_like(violation)  # not 0 * violation: nan must not leak

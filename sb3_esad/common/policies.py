@@ -1,6 +1,6 @@
 """The policy of all latent algorithms: it owns every network, and acts with a memory that the caller carries."""
 
-from contextlib import nullcontext
+from collections.abc import Callable
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,7 +17,6 @@ from sb3_esad.common.checks import require
 from sb3_esad.common.critics import CostCritic, QEnsemble
 from sb3_esad.common.extractors import CombinedExtractor, SpatialCnn, VectorExtractor, grid_shape
 from sb3_esad.common.latents import GaussianHead, LatentHead
-from sb3_esad.common.noise import fixed_seed
 from sb3_esad.common.numpy_state import NumpyState, from_numpy, to_numpy
 from sb3_esad.common.optimizers import MuonWithAdam
 from sb3_esad.common.rssm import RSSM
@@ -52,7 +51,7 @@ class LatentPolicy(BasePolicy):
     :param optimizer_kwargs: arguments of the optimisers
     """
 
-    head_class: ClassVar[type[LatentHead]] = GaussianHead
+    make_head: ClassVar[Callable[..., LatentHead]] = GaussianHead
     extractor_class: ClassVar[type[BaseFeaturesExtractor]] = VectorExtractor
     cost_critic_class: ClassVar[type[CostCritic]] = CostCritic
     action_space: spaces.Box
@@ -124,7 +123,7 @@ class LatentPolicy(BasePolicy):
         memory_channels = memory_channels if self.memory_channels is None else self.memory_channels
         latent_channels = latent_channels if self.latent_channels is None else self.latent_channels
         memory_shape = (memory_channels, height, width)
-        head = self.head_class(
+        head = self.make_head(
             memory_shape, embedding_channels, latent_channels, hidden_channels=memory_shape[0], **self.head_kwargs
         )
         rssm = RSSM(memory_shape, latent_channels, get_action_dim(self.action_space), head)
@@ -219,9 +218,8 @@ class LatentPolicy(BasePolicy):
         :return: what is known now, and what shall be executed
         """
         belief = self.average.observe(observation, state, episode_start, deterministic)
-        proposed = self.average.act(belief.state, deterministic)
-        with fixed_seed(self.device) if deterministic else nullcontext():
-            return belief, self.action_filter.select(self.average, belief, proposed)
+        select = self.action_filter.select_alone if deterministic else self.action_filter.select
+        return belief, select(self.average, belief, self.average.act(belief.state, deterministic))
 
     def forward(self, observation: PyTorchObs, deterministic: bool = False) -> th.Tensor:
         """

@@ -11,17 +11,18 @@ class RecentSums(nn.Module):
     Not a moving average: its tail would remember for three times as long what an agent that has learned since then has done.
 
     :param names: of the quantities
-    :param steps: length of the window
+    :param steps: length of the window, until another is set
     :param blocks: into how many parts it is cut; the window holds ``steps`` to within a part, or to within one call of ``add``
     """
 
     blocks: th.Tensor
     newest: th.Tensor
+    length: th.Tensor
 
     def __init__(self, names: tuple[str, ...], steps: int, blocks: int = 20) -> None:
         super().__init__()
         self.names = ("steps", *names)
-        self.steps = steps
+        self.register_buffer("length", th.tensor(float(steps)))
         self.register_buffer("blocks", th.zeros(blocks, len(self.names)))
         self.register_buffer("newest", th.zeros(()))
 
@@ -33,7 +34,7 @@ class RecentSums(nn.Module):
         :param values: sums over these steps, by name; those left out are zero
         """
         block = self.blocks[int(self.newest)]
-        if block[0] >= self.steps / len(self.blocks):
+        if block[0] >= self.length / len(self.blocks):
             self.newest.add_(1).remainder_(len(self.blocks))
             block = self.blocks[int(self.newest)].zero_()
         row = {**dict.fromkeys(self.names, 0.0), "steps": float(steps), **values}

@@ -130,6 +130,9 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
         if not isinstance(self.action_space, spaces.Box):
             remedy = "with highway-env, configure its action as {'type': 'ContinuousAction'}, or wrap the environment"
             raise ValueError(f"{type(self).__name__} needs a Box of actions, not {self.action_space}: {remedy}.")
+        if not np.issubdtype(self.action_space.dtype, np.floating):
+            remedy = "give it another dtype, and round in the environment"
+            raise ValueError(f"{type(self).__name__} needs actions of floating point, not {self.action_space}: {remedy}.")
 
     def _check_arguments(self) -> None:
         super()._check_arguments()
@@ -164,6 +167,9 @@ class RecurrentOffPolicyAlgorithm(CostAwareAlgorithm):
         executed = actions if warm_up else self._select(belief, actions)
         self._last_latent = belief.state._replace(action=executed)
         shaped = executed.cpu().numpy().reshape(n_envs, *self.action_space.shape)
+        if not np.isfinite(shaped).all():
+            found = f"An action is {shaped[~np.isfinite(shaped)][0]} after {self._n_updates} updates"
+            raise ValueError(f"{found}: learning has diverged, choose a smaller learning_rate or max_grad_norm.")
         return self.policy.unscale_action(shaped).astype(self.action_space.dtype), shaped
 
     def _select(self, belief: Belief, proposed: th.Tensor) -> th.Tensor:

@@ -2,13 +2,13 @@
 
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch as th
 
 from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.foresight import Foresight, Outlook
+from sb3_esad.common.noise import fixed_seed
 from sb3_esad.common.penalties import Penalty
 from sb3_esad.common.type_aliases import Belief, LatentState, Logs
 
@@ -26,18 +26,27 @@ class Selection(NamedTuple):
     :param actions: scaled to [-1, 1], of shape (N, A)
     :param intervened: whether the proposed action was replaced, of shape (N,)
     :param helpless: whether nothing was admissible and the action of least risk was taken, of shape (N,)
+    :param risks: Gamma of the proposed action where it was judged, nan elsewhere, of shape (N,)
     """
 
     actions: th.Tensor
     intervened: th.Tensor
     helpless: th.Tensor
+    risks: th.Tensor
+
+    @property
+    def judged(self) -> th.Tensor:
+        """Whether the proposed action was judged at all, of shape (N,)."""
+        return ~self.risks.isnan()
 
 
 class SelectionRates:
-    """How often actions have been replaced lately."""
+    """How often actions have been judged and replaced lately."""
+
+    names = ("filter_rate", "intervention_rate", "fallback_rate")
 
     def __init__(self) -> None:
-        self._n_actions, self._counts = 0, th.zeros(2)
+        self._n_actions, self._counts = 0, th.zeros(len(self.names))
 
     def note(self, selection: Selection) -> None:
         """
@@ -46,7 +55,8 @@ class SelectionRates:
         :param selection: of that step
         """
         self._n_actions += len(selection.actions)
-        self._counts = self._counts.to(selection.actions.device) + th.stack([selection.intervened, selection.helpless]).sum(1)
+        events = th.stack([selection.judged, selection.intervened, selection.helpless])
+        self._counts = self._counts.to(events.device) + events.sum(1)
 
     def take(self) -> Logs:
         """
@@ -55,9 +65,8 @@ class SelectionRates:
         :return: shares of the actions, empty if there were none
         """
         n_actions, counts = self._n_actions, self._counts.tolist()
-        self._n_actions, self._counts = 0, th.zeros(2)
-        names = ("intervention_rate", "fallback_rate")
-        return {name: count / n_actions for name, count in zip(names, counts, strict=True)} if n_actions else {}
+        self._n_actions, self._counts = 0, th.zeros(len(self.names))
+        return {name: count / n_actions for name, count in zip(self.names, counts, strict=True)} if n_actions else {}
 
 
 def draw_scenarios(agent: LatentAgent, belief: Belief, n: int) -> LatentState:
@@ -96,6 +105,23 @@ class ActionFilter(ABC):
         :return: the actions to execute
         """
 
+    def select_alone(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
+        """
+        Decide likewise, in each state as if there were no others and with the same random numbers each time.
+
+        :param agent: whose world model and critics judge
+        :param belief: N states and their observations
+        :param proposed: the actor's actions, of shape (N, A)
+        :return: the actions to execute
+        """
+        selections = []
+        for place in range(len(proposed)):
+            alone = slice(place, place + 1)
+            state = LatentState(*(field[alone] for field in belief.state))
+            with fixed_seed(proposed.device):
+                selections.append(self.select(agent, Belief(state, belief.embedding[alone]), proposed[alone]))
+        return Selection(*map(th.cat, zip(*selections, strict=True)))
+
 
 class NoFilter(ActionFilter):
     """
@@ -109,7 +135,9 @@ class NoFilter(ActionFilter):
 
     def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
         never = th.zeros(len(proposed), dtype=th.bool, device=proposed.device)
-        return Selection(proposed, never, never)
+        return Selection(proposed, never, never, proposed.new_full((len(proposed),), math.nan))
+
+    select_alone = select
 
 
 class SafetyFilter(ActionFilter):
@@ -120,8 +148,8 @@ class SafetyFilter(ActionFilter):
     critics fear it most; only these are imagined. To choose among latents, as in figure 3 of arXiv 2407.06317, would be to
     choose the world in which there is no car.
 
-    :param penalty: tells what is admissible
-    :param is_active: whether the critics may be trusted with that
+    :param penalty: tells what is admissible, and whether the critics may be trusted with that
+    :param filter_start: updates of the penalty before which they are not
     :param foresight: imagines where an action leads
     :param risk_level: fraction of the worst scenarios that counts
     :param n_candidates: scenarios of which the critics choose the worst for each action
@@ -132,14 +160,14 @@ class SafetyFilter(ActionFilter):
     def __init__(
         self,
         penalty: Penalty,
-        is_active: Callable[[], bool],
+        filter_start: int,
         foresight: Foresight,
         risk_level: float,
         n_candidates: int = 8,
         n_proposals: int = 16,
     ) -> None:
         self.penalty = penalty
-        self.is_active = is_active
+        self.filter_start = filter_start
         self.foresight = foresight
         self.risk_level = risk_level
         self.n_candidates = n_candidates
@@ -147,7 +175,7 @@ class SafetyFilter(ActionFilter):
 
     @th.no_grad()
     def select(self, agent: LatentAgent, belief: Belief, proposed: th.Tensor) -> Selection:
-        if not self.is_active():
+        if not self.penalty.trusts_critics(self.filter_start):
             return NoFilter().select(agent, belief, proposed)
         scenarios = draw_scenarios(agent, belief, self.n_candidates)
         own = self.assess(agent, scenarios, proposed[None])
@@ -158,7 +186,7 @@ class SafetyFilter(ActionFilter):
             state = belief.state.map(lambda field: field[doubtful])
             known = Outlook(*(field[:, doubtful] for field in own))
             actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful], known)
-        return Selection(actions, (actions != proposed).any(1), helpless)
+        return Selection(actions, (actions != proposed).any(1), helpless, own.risks[0])
 
     def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> Outlook:
         """
@@ -183,7 +211,8 @@ class SafetyFilter(ActionFilter):
         return states.map(lambda field: field.take_along_dim(worst.view(*worst.shape, *[1] * (field.dim() - 3)), dim=0))
 
     def _admissible(self, outlook: Outlook) -> th.Tensor:
-        return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget))
+        # Both by the same bound: where the budget is nearly 0, critics never expect so little
+        return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget_scale))
 
     def _choose(
         self, agent: LatentAgent, scenarios: LatentState, state: LatentState, proposed: th.Tensor, own: Outlook

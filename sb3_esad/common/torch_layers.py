@@ -7,6 +7,8 @@ from torch import nn
 
 GridShape = tuple[int, int, int]
 """Channels, height and width of a grid of features."""
+FLAT_FEATURES = 512
+"""How many numbers the cells of a grid may hold together before they are mixed."""
 
 
 class LearningModule(nn.Module):
@@ -45,10 +47,11 @@ class SameConv2d(nn.Conv2d):
     :param in_channels: channels of the input
     :param out_channels: channels of the output
     :param kernel: odd width of the kernel
+    :param bias: whether a bias is added
     """
 
-    def __init__(self, in_channels: int, out_channels: int, kernel: int) -> None:
-        super().__init__(in_channels, out_channels, kernel, padding=kernel // 2)
+    def __init__(self, in_channels: int, out_channels: int, kernel: int, bias: bool = True) -> None:
+        super().__init__(in_channels, out_channels, kernel, padding=kernel // 2, bias=bias)
 
     def forward(self, grid: th.Tensor) -> th.Tensor:
         """
@@ -119,13 +122,12 @@ class GridReadout(Readout):
 
     :param shape: shape of the grid (C, H, W)
     :param features_dim: length of the summary
-    :param flat_features: how many numbers the cells may hold together before they are mixed
     """
 
-    def __init__(self, shape: GridShape, features_dim: int, flat_features: int = 512) -> None:
+    def __init__(self, shape: GridShape, features_dim: int) -> None:
         super().__init__()
         channels, height, width = shape
-        cell_features = max(1, min(channels, flat_features // (height * width)))
+        cell_features = max(1, min(channels, FLAT_FEATURES // (height * width)))
         self.features_dim = features_dim
         self.cells = nn.Sequential(SameConv2d(channels, cell_features, 1), nn.SiLU())
         self.mix = nn.Sequential(
@@ -160,11 +162,10 @@ class SparseReadout(GridReadout):
 
     :param shape: shape of the grid (C, H, W)
     :param features_dim: length of the summary
-    :param flat_features: how many numbers the cells may hold together before they are mixed
     """
 
-    def __init__(self, shape: GridShape, features_dim: int, flat_features: int = 512) -> None:
-        super().__init__(shape, features_dim, flat_features)
+    def __init__(self, shape: GridShape, features_dim: int) -> None:
+        super().__init__(shape, features_dim)
         flatten, linear, _, activation = self.mix
         self.cells[1] = ChannelNorm(self.cells[0].out_channels)
         # Not normalised once it is mixed, for that would give back what small weights take away

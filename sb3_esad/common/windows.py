@@ -53,6 +53,8 @@ class WindowIndex:
 
     def draw(self, n: int) -> Starts:
         """
+        Draw among all windows.
+
         :param n: number of windows
         :return: their starts
         """
@@ -61,7 +63,9 @@ class WindowIndex:
 
     def draw_events(self, n: int) -> Starts:
         """
-        :param n: number of windows with an event, as likely relative to each other as in :meth:`draw`; 0 if there are none
+        Draw among those with an event, as likely relative to each other as in :meth:`draw`.
+
+        :param n: number of windows; 0 if there are none
         :return: their starts
         """
         shares = np.random.rand(n) * self._cumulated[-1]

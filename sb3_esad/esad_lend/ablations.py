@@ -4,20 +4,16 @@ from typing import ClassVar
 
 from stable_baselines3.common.policies import BasePolicy
 
+from sb3_esad.common.latent_algorithm import LatentAlgorithm
 from sb3_esad.common.penalties import NoPenalty
 from sb3_esad.common.selection import NoFilter
 from sb3_esad.esad_lend.esad_lend import ESADLEND
-from sb3_esad.esad_lend.policies import GaussianCnnPolicy, GaussianMlpPolicy, GaussianMultiInputPolicy
 
 
 class SADLEN(ESADLEND):
     """ESAD-LEND with Gaussian latents: the ablation without diffusion."""
 
-    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = {
-        "MlpPolicy": GaussianMlpPolicy,
-        "CnnPolicy": GaussianCnnPolicy,
-        "MultiInputPolicy": GaussianMultiInputPolicy,
-    }
+    policy_aliases: ClassVar[dict[str, type[BasePolicy]]] = LatentAlgorithm.policy_aliases
 
 
 class ADEND(ESADLEND):

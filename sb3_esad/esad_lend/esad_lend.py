@@ -66,6 +66,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         policy: str | type[LatentPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = FALLING_RATE,
+        *,
         cost_limit: float | None = 0.05,
         risk_level: float = 0.5,
         ent_coef: str | float = "auto_0.03",

@@ -1,27 +1,22 @@
-"""Policies of ESAD-LEND by SB3's names, with diffusion latents, and their twins with Gaussian ones."""
+"""Policies of ESAD-LEND by SB3's names, whose latents can be refined by diffusion."""
 
-from sb3_esad.common.diffusion import DiffusionHead
+from sb3_esad.common.diffusion import make_head
 from sb3_esad.common.policies import LatentCnnPolicy, LatentMultiInputPolicy, LatentPolicy
 
 
 class MlpPolicy(LatentPolicy):
-    """Policy for vectors, whose latents are refined by diffusion."""
+    """:class:`LatentPolicy` for vectors, with diffusion if ``head_kwargs`` has ``diffusion_steps``."""
 
-    head_class = DiffusionHead
+    make_head = staticmethod(make_head)
 
 
 class CnnPolicy(LatentCnnPolicy):
-    """Policy for images, whose latents are refined by diffusion."""
+    """:class:`LatentCnnPolicy` for images, with diffusion if ``head_kwargs`` has ``diffusion_steps``."""
 
-    head_class = DiffusionHead
+    make_head = staticmethod(make_head)
 
 
 class MultiInputPolicy(LatentMultiInputPolicy):
-    """Policy for dictionaries of images and vectors, whose latents are refined by diffusion."""
+    """:class:`LatentMultiInputPolicy` for dictionaries, with diffusion if ``head_kwargs`` has ``diffusion_steps``."""
 
-    head_class = DiffusionHead
-
-
-GaussianMlpPolicy = LatentPolicy
-GaussianCnnPolicy = LatentCnnPolicy
-GaussianMultiInputPolicy = LatentMultiInputPolicy
+    make_head = staticmethod(make_head)

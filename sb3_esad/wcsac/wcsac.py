@@ -13,6 +13,7 @@ from sb3_esad.common.checks import require
 from sb3_esad.common.cost_buffers import CostReplayBuffer
 from sb3_esad.common.cost_limited_algorithm import CostLimitedAlgorithm
 from sb3_esad.common.functional import rising_cvar
+from sb3_esad.common.optimizers import differentiate
 from sb3_esad.common.target_networks import update_target
 from sb3_esad.common.type_aliases import CostReplaySamples, Logs
 from sb3_esad.wcsac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, WCSACPolicy
@@ -50,6 +51,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         policy: str | type[WCSACPolicy],
         env: GymEnv | str,
         learning_rate: float | Schedule = 3e-4,
+        *,
         cost_limit: float | None = 0.05,
         risk_level: float = 0.5,
         _init_setup_model: bool = True,
@@ -118,7 +120,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
             targets = samples.rewards + (1 - samples.dones) * self.gamma * next_value
         values = self.critic(samples.observations, samples.actions)
         loss = 0.5 * th.stack([F.mse_loss(value, targets) for value in values]).sum()
-        _minimize(loss, self.critic.optimizer)
+        self._minimize(loss, self.critic.optimizer)
         return {"critic_loss": loss.item()}
 
     def _update_cost_critic(self, samples: CostReplaySamples, next_actions: th.Tensor) -> Logs:
@@ -127,7 +129,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         costs, continues = samples.costs.flatten(), 1 - samples.dones.flatten()
         targets = self.policy.cost_critic_target.targets(taken, reached, costs, continues, self.discount_of_cost)
         mean_loss, variance_loss = self.policy.cost_critic.loss(*taken, *targets)
-        _minimize((mean_loss + variance_loss).mean(), self.policy.cost_critic.optimizer)
+        self._minimize((mean_loss + variance_loss).mean(), self.policy.cost_critic.optimizer)
         return {"cost_critic_loss": mean_loss.mean().item(), "cost_var_loss": variance_loss.mean().item()}
 
     def _update_actor(self, observations: PyTorchObs, actions: th.Tensor, entropy_term: th.Tensor) -> Logs:
@@ -135,8 +137,13 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         means, variance = self.policy.cost_critic(observations, actions)
         risk = rising_cvar(means, variance, self.risk_level).max(0).values[:, None]
         loss = self.penalty.combine(entropy_term - value, risk, th.zeros_like(risk)).mean()
-        _minimize(loss, self.actor.optimizer)
+        self._minimize(loss, self.actor.optimizer)
         return {"actor_loss": loss.item(), "safety/replayed_risk": risk.mean().item()}
+
+    @staticmethod
+    def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
+        differentiate(loss, optimizer)
+        optimizer.step()
 
     def _last_state(self) -> PyTorchObs:
         assert self._last_obs is not None
@@ -161,11 +168,3 @@ class SACLag(WCSAC):
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         super().__init__(*args, **{"risk_level": 1.0, **kwargs})
-
-
-def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
-    """Minimise a loss by one step of one network; whatever else it passed through stays."""
-    optimizer.zero_grad()
-    parameters = (parameter for group in optimizer.param_groups for parameter in group["params"])
-    loss.backward(inputs=[parameter for parameter in parameters if parameter.requires_grad])
-    optimizer.step()
