@@ -1,4 +1,4 @@
-"""The experiments of docs/experiments.md: what each asks, where, and of which arms; ``experiments.py`` runs them."""
+"""The experiments of docs/experiments.md: what each asks, where, and of which arms or scripts; ``experiments.py`` runs them."""
 
 from typing import Any, NamedTuple
 
@@ -114,3 +114,13 @@ EXPERIMENTS = {
         },
     ),
 }
+SCRIPTS: dict[str, list[list[str]]] = {
+    "E0": [["diffusion.py", "--env", env_id] for env_id in ("esad-traffic-negotiation-v0", "esad-course-2mps-v0")],
+    "E1": [
+        ["driving.py", "esad_lend", "--few-updates", "--save-buffer"],
+        ["variance_loss.py", "runs/esad_lend_0.zip", "runs/esad_lend_0.pkl"],
+    ],
+    "E8": [["driving.py", "esad_lend", "--seed", seed] for seed in ("0", "1", "2")],
+    "E10": [["world_model.py"]],
+}
+"""Experiments that are no comparison of trainings: what is run one after the other."""

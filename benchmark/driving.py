@@ -7,6 +7,7 @@ actions, and appends a line of JSON for each to ``OUT/<algorithm>_<seed>.jsonl``
 """
 
 import argparse
+import csv
 import json
 import time
 from collections.abc import Callable
@@ -25,11 +26,18 @@ from stable_baselines3.common.preprocessing import is_image_space
 from variants import VARIANTS
 
 from sb3_esad import ADEND, ESADLEND, SADLEN, WCSAC, SACLag
+from sb3_esad.common.selection import SelectionRates
 from sb3_esad.demo import FEW_UPDATES
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.metrics import summarise
 from sb3_esad.hyperparams import load_hyperparams
 
+LOGGED = (
+    "train/lagrangian_multiplier",
+    "safety/cost_calibration",
+    *(f"rollout/{name}" for name in SelectionRates.names),
+)
+"""Of the training's log, what belongs beside its curve."""
 UNSEEN = 2_000_000
 """First seed of the evaluation; tune on others (--unseen)."""
 
@@ -104,6 +112,20 @@ ALGORITHMS: dict[str, Callable[[str, int, dict[str, Any]], OffPolicyAlgorithm]] 
 }
 
 
+def usual(log: Path, after: int) -> dict[str, float]:
+    """
+    Average what a training has logged.
+
+    :param log: its progress.csv
+    :param after: steps before which lines do not count
+    :return: means of those of ``LOGGED`` that there are
+    """
+    with log.open() as file:
+        lines = [line for line in csv.DictReader(file) if int(line["time/total_timesteps"]) > after]
+    found = {key: [float(line[key]) for line in lines if line.get(key)] for key in LOGGED}
+    return {key: sum(values) / len(values) for key, values in found.items() if values}
+
+
 class LearningCurve(BaseCallback):
     """
     Drives unseen episodes every ``every`` steps, and at the end.
@@ -120,7 +142,7 @@ class LearningCurve(BaseCallback):
 
     def _on_training_start(self) -> None:
         self._next, self._seconds, self._resumed = self.every, 0.0, time.monotonic()
-        self._cost, self._episodes = 0.0, 0
+        self._cost, self._episodes, self._evaluated = 0.0, 0, 0
         self._cost_steps: list[int] = []
 
     def _on_step(self) -> bool:
@@ -141,6 +163,8 @@ class LearningCurve(BaseCallback):
         self._seconds += time.monotonic() - self._resumed
         line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
         line |= {"training_cost": self._cost, "training_episodes": self._episodes, "cost_steps": self._cost_steps}
+        line["log"] = usual(self.path.with_suffix("") / "progress.csv", self._evaluated)
+        self._evaluated = self.num_timesteps
         for name, deterministic in (("best", True), ("sampled", False)):
             line[name] = summarise(evaluate_model(self.model, self.env_id, self.seeds, deterministic))
         with self.path.open("a") as file:

@@ -3,7 +3,8 @@ The experiments of docs/experiments.md by name: ``python benchmark/experiments.p
 
 Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept,
 also where the code has changed since: move it away then.
-Those that imagine have the demo's budget: 20,000 steps, about a thousand updates. The table pools the last evaluation of all
+Those that imagine have the demo's budget: 20,000 steps, about a thousand updates. E0, E1, E8 and E10 are scripts of their own,
+with options of their own. The table pools the last evaluation of all
 seeds: driving score with the interval over seeds, the rest over episodes. Costs in training are counted for each seed, and
 again from the step on at which all arms have begun to learn.
 """
@@ -19,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from arms import EXPERIMENTS, IMAGINING, Arm
+from arms import EXPERIMENTS, IMAGINING, SCRIPTS, Arm
 
 from sb3_esad.envs.intervals import mean_interval, wilson_interval
 
@@ -100,13 +101,24 @@ def row(name: str, ends: list[dict[str, Any]]) -> str:
         free = round(sum(end[mode]["collision_free"] * end[mode]["episodes"] for end in ends))
         safe = 100 * np.array(wilson_interval(free, n))
         speed = np.mean([end[mode]["speed"] for end in ends])
-        cells.append(
-            f"{scores.mean():.1f} [{low:.1f}, {high:.1f}], {100 * free / n:.0f} [{safe[0]:.0f}, {safe[1]:.0f}], {speed:.1f}"
-        )
+        route, safety = np.mean([end[mode]["RC"] for end in ends]), f"{100 * free / n:.0f} [{safe[0]:.0f}, {safe[1]:.0f}]"
+        cells.append(f"{scores.mean():.1f} [{low:.1f}, {high:.1f}], {safety}, {route:.0f}, {speed:.1f}")
     nearness = np.mean([end["best"]["TTC_5"] for end in ends])
     later = [sum(step > PRACTISED for step in end["cost_steps"]) for end in ends]
     costs = ", ".join(f"{len(end['cost_steps'])} ({n})" for end, n in zip(ends, later, strict=True))
-    return f"| {name} | {' | '.join(cells)} | {nearness:.2f} | {costs} |"
+    minutes = ", ".join(f"{end['seconds'] / 60:.0f}" for end in ends)
+    return f"| {name} | {' | '.join(cells)} | {nearness:.2f} | {costs} | {filtered(ends)} | {minutes} |"
+
+
+def filtered(ends: list[dict[str, Any]]) -> str:
+    """
+    Say what the filter did in the last part of the trainings.
+
+    :param ends: last evaluations of an arm
+    :return: shares of the steps that it judged, and of the actions that it replaced, for each seed
+    """
+    rates = [[end.get("log", {}).get(f"rollout/{name}") for name in ("filter_rate", "intervention_rate")] for end in ends]
+    return ", ".join(f"{judged:.2f} / {replaced:.2f}" for judged, replaced in rates if judged is not None)
 
 
 def print_table(every: list[Run]) -> None:
@@ -115,8 +127,9 @@ def print_table(every: list[Run]) -> None:
 
     :param every: trainings of an experiment
     """
-    print("| scenario, arm | best: DS, collision-free %, m/s | sampled | best: TTC_5 [s] | costs in training |")
-    print("|---|---|---|---|---|")
+    print("| scenario, arm | best: DS, collision-free %, RC %, m/s | sampled | best: TTC_5 [s] | ", end="")
+    print("costs in training | filter at work / replaced | minutes |")
+    print("|---|---|---|---|---|---|---|")
     ends: dict[str, list[dict[str, Any]]] = {}
     for run in every:
         if run.curve.exists():
@@ -128,7 +141,7 @@ def print_table(every: list[Run]) -> None:
 def main() -> None:
     """Run an experiment, or print its table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("name", choices=list(EXPERIMENTS))
+    parser.add_argument("name", choices=[*EXPERIMENTS, *SCRIPTS])
     parser.add_argument("--seeds", type=int, nargs="+", default=[0, 1, 2])
     parser.add_argument("--envs", nargs="+", help="scenarios, instead of all that the experiment has")
     parser.add_argument("--steps", type=int, default=20_000)
@@ -136,6 +149,10 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--table", action="store_true", help="print what has been found so far")
     args = parser.parse_args()
+    if args.name in SCRIPTS:
+        for script, *arguments in SCRIPTS[args.name]:
+            subprocess.run([sys.executable, str(Path(__file__).with_name(script)), *arguments], check=True)
+        return
     experiment = EXPERIMENTS[args.name]
     every = list(runs(args.name, args.envs or experiment.envs, args.seeds, args.out))
     if not args.table:

@@ -76,7 +76,7 @@ def steps(env: gym.Env[Any, Any], seed: int) -> Iterator[Step]:
             observation = following
 
 
-def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int) -> SequenceReplayBuffer:
+def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int, **kwargs: Any) -> SequenceReplayBuffer:
     """
     Fill a replay buffer.
 
@@ -84,9 +84,11 @@ def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int) -> Sequ
     :param n_steps: how many steps
     :param seed: of scenario and drivers
     :param length: steps in a window
-    :return: the buffer
+    :param kwargs: further arguments of the buffer
+    :return: the buffer, to which all steps are equally new
     """
-    buffer = SequenceReplayBuffer(n_steps, env.observation_space, env.action_space, "auto", sequence_length=length)
+    spaces = env.observation_space, env.action_space
+    buffer = SequenceReplayBuffer(n_steps, *spaces, "auto", sequence_length=length, recency=0.0, **kwargs)
     for _, step in zip(range(n_steps), steps(env, seed), strict=False):
         observation, following, action, reward, done = (np.array([field]) for field in step[:-1])
         buffer.add(observation, following, action, reward, done, [step.info])

@@ -79,18 +79,28 @@ def explaining_frame(moment: Moment, driver: ExplainedDriver) -> Picture:
     for name, place in places.items():
         title = f"In {ahead:.0f} s, {name} of {len(futures.costs)}: cost {100 * futures.costs[place]:.1f} %"
         panels[title] = _picture(futures.images, place)
+    mean, tail = futures.costs.mean().item(), driver.tail(futures)
     gauges = [
         _speed(moment),
         _risk(driver.model, "risk of the action", driver.risk),
-        _risk(driver.model, "mean of the futures", futures.costs.mean().item()),
-        _risk(driver.model, "worst of them", driver.tail(futures)),
+        _judgement(driver) if driver.selection.judged else _risk(driver.model, "mean of the futures", mean),
+        _risk(driver.model, "worst of the futures", tail),
     ]
     return compose(render(moment.env), panels, gauges, moment.verdict, FUTURES)
+
+
+def _judgement(driver: ExplainedDriver) -> Gauge:
+    """What the filter has foreseen of the action that the actor proposed, beside the most that it admits."""
+    risk, allowed = driver.selection.risks.item(), driver.model.penalty.budget_scale
+    label, colour = f"as the filter judged the actor's, at most {100 * allowed:.2f} %", BAD if risk > allowed else GOOD
+    return Gauge(label, f"{100 * risk:.1f} %", _risk_share(risk), _risk_share(allowed), colour)
 
 
 def _verdict_of_filter(driver: ExplainedDriver) -> tuple[str, Colour]:
     if isinstance(driver.model.policy.action_filter, NoFilter):
         return "It has no filter", FAINT
+    if not driver.selection.judged:
+        return "Filter: at rest, for its critics are not trusted", FAINT
     if driver.selection.helpless:
         return "Filter: nothing is safe, least risk taken", BAD
     return ("Filter: another action taken", MARK) if driver.selection.intervened else ("Filter: the actor's own action", GOOD)

@@ -39,5 +39,5 @@ def test_no_cost_reaches_the_actor_of_ad_end(monkeypatch: pytest.MonkeyPatch) ->
     assert isinstance(model.penalty, NoPenalty)
     undisturbed = th.nn.utils.parameters_to_vector(model.learn(40).policy.actor.parameters())
     assert th.equal(actor_weights(ADEND, monkeypatch), undisturbed)
-    with pytest.raises(ValueError, match="An action is nan after .* updates: learning has diverged"):
+    with pytest.raises(ValueError, match=r"An action is nan after .* updates: learning has diverged"):
         actor_weights(ESADLEND, monkeypatch)

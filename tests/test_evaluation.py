@@ -15,12 +15,14 @@ from gymnasium.wrappers import RecordVideo
 from stable_baselines3 import SAC
 from stable_baselines3.common.vec_env import DummyVecEnv, VecFrameStack, VecNormalize, VecVideoRecorder
 
-from sb3_esad import ESADLEND, WCSAC
+from sb3_esad import ESADLEND, WCSAC, moments
+from sb3_esad.common.selection import Selection
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.dream import DreamingDriver
 from sb3_esad.driving_evaluation import SeededEpisodes, evaluate_driver, evaluate_model, stack_frames
 from sb3_esad.envs.metrics import DrivingMetrics
 from sb3_esad.explanation import ExplainedDriver
+from sb3_esad.moments import Moment, explaining_frame
 from sb3_esad.panels import HEIGHT, PANEL, ROW, WIDTH, Gauge, compose, paint
 from sb3_esad.plots import plot_learning_curve
 from sb3_esad.progress import Deadline, EpisodeProgressBar, TrainingEpisode
@@ -270,6 +272,32 @@ def test_what_is_explained_is_what_is_done(model: ESADLEND) -> None:
     assert futures.images["observation"].shape == (5, 3, 64, 64)
     assert driver.tail(futures) == pytest.approx(futures.costs[:3].mean().item())  # of 5 the worst half
     th.testing.assert_close(driver.futures().costs, futures.costs, msg="the same moment is explained by the same futures")
+
+
+@pytest.mark.parametrize(
+    ("risk", "intervened", "helpless", "words", "label"),
+    [
+        (np.nan, False, False, "Filter: at rest, for its critics are not trusted", "mean of the futures"),
+        (0.001, False, False, "Filter: the actor's own action", "as the filter judged the actor's, at most 1.00 %"),
+        (0.3, True, False, "Filter: another action taken", "as the filter judged the actor's, at most 1.00 %"),
+        (0.3, True, True, "Filter: nothing is safe, least risk taken", "as the filter judged the actor's, at most 1.00 %"),
+    ],
+)
+def test_the_film_tells_what_the_filter_has_done(
+    risk: float, intervened: bool, helpless: bool, words: str, label: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shown: list[Any] = []
+    monkeypatch.setattr(moments, "compose", lambda scene, panels, gauges, *text: shown.extend([panels, gauges]))
+    env = gym.make("short-image-v0", render_mode="rgb_array")
+    driver = ExplainedDriver(make_model("CnnPolicy", filter_start=0))
+    observation, info = env.reset(seed=0)
+    driver(observation)
+    driver.selection = Selection(driver.selection.actions, *(th.tensor([value]) for value in (intervened, helpless, risk)))
+    explaining_frame(Moment(env, observation, info, 0.0, ""), driver)
+    panels, gauges = shown
+    assert words in panels
+    (gauge,) = (each for each in gauges if each.label.startswith(label))
+    assert np.isnan(risk) or gauge.text == f"{100 * risk:.1f} %"
 
 
 def test_record_explanation(model: ESADLEND, tmp_path: Path) -> None:

@@ -54,6 +54,11 @@ def test_every_entry_builds_a_model(name: str, env_id: str) -> None:
             assert getattr(model, key) == value
 
 
+@pytest.mark.parametrize("env_id", [env_id for name, env_id in ENTRIES if name == "ad_end"])
+def test_ad_end_has_diffusion_everywhere(env_id: str) -> None:
+    assert read_entries(FOLDER / "ad_end.yml")[env_id]["policy_kwargs"]["head_kwargs"] == {"diffusion_steps": 2}
+
+
 @pytest.mark.parametrize(("name", "env_id"), ENTRIES)
 def test_no_entry_repeats_a_default(name: str, env_id: str) -> None:
     for key, value in load_hyperparams(ALGORITHMS[name], name, env_id).arguments.items():
