@@ -1,4 +1,4 @@
-"""The experiments of docs/experiments.md: what each asks, where, and of which arms or scripts; ``experiments.py`` runs them."""
+"""The experiments of docs/experiments.md: what each asks, where, of which arms or scripts; ``experiments.py`` runs them."""
 
 from typing import Any, NamedTuple
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import driving
 import pytest
 from stable_baselines3 import SAC
+from stable_baselines3.common.logger import configure
 from upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_AD_END, DOES_NOT_APPLY_TO_LATENTS
 
 from tests.conftest import CountingEnv
@@ -47,10 +48,21 @@ def test_a_learning_curve_has_one_point_at_the_end_and_all_costs(
     monkeypatch.setattr(driving, "evaluate_model", lambda *args: [])
     monkeypatch.setattr(driving, "summarise", lambda records: {})
     curve = driving.LearningCurve(tmp_path / "curve.jsonl", "CountingEnv", every=8, seeds=range(1))
-    SAC("MlpPolicy", CountingEnv(), learning_starts=100, buffer_size=100, train_freq=4).learn(total, callback=curve)
+    model = SAC("MlpPolicy", CountingEnv(), learning_starts=100, buffer_size=100, train_freq=4)
+    model.set_logger(configure(str(tmp_path / "curve"), ["csv"]))
+    model.learn(total, callback=curve)
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert [line["steps"] for line in lines] == steps
     assert lines[-1]["cost_steps"] == [step for step in (3, 6, 10, 13, 17, 20) if step <= total]
+
+
+def test_beside_a_curve_stands_what_has_been_logged_since_its_last_point(tmp_path: Path) -> None:
+    log = tmp_path / "progress.csv"
+    log.write_text(
+        "time/total_timesteps,rollout/filter_rate,train/lagrangian_multiplier,time/fps\n10,1.0,5.0,1\n20,0.5,7.0,1\n30,0.0,,1\n"
+    )
+    assert driving.usual(log, 10) == {"rollout/filter_rate": 0.25, "train/lagrangian_multiplier": 7.0}
+    assert driving.usual(log, 30) == {}
 
 
 def names_one_of(row: str, pattern: str) -> bool:

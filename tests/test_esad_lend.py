@@ -585,7 +585,7 @@ def test_a_line_of_the_log_is_the_mean_of_all_updates_since_the_last_one() -> No
     model = make_model().learn(24)
     model.logger.dump(0)
     for losses in ([1.0, 3.0], [8.0, 8.0]):
-        model._record({"critic_loss": losses})
+        model._record({"critic_loss": list(th.tensor(losses))})
     assert model.logger.name_to_value["train/critic_loss"] == 5.0
 
 

@@ -176,11 +176,11 @@ class CostAwareAlgorithm(WholeFiles):
         self.logger.record("rollout/cost_rate", self.total_cost / max(self.num_timesteps, 1))
         super().dump_logs()
 
-    def _record(self, logs: dict[str, list[float]]) -> None:
+    def _record(self, logs: dict[str, list[th.Tensor]]) -> None:
         """Log the means of what the updates since the last line have brought."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
         for name, values in logs.items():
-            self.logger.record_mean(key_of(name), float(np.mean(values)))
+            self.logger.record_mean(key_of(name), th.stack(values).float().mean().item())
 
     def _setup_learn(
         self,

@@ -10,7 +10,7 @@ from sb3_esad.common.denoiser import Denoiser
 from sb3_esad.common.latents import Gaussian, GaussianHead, LatentHead
 from sb3_esad.common.target_networks import make_target, update_target
 from sb3_esad.common.torch_layers import GridShape
-from sb3_esad.common.type_aliases import Logs
+from sb3_esad.common.type_aliases import TensorLogs
 
 MOST_STEPS = 1000
 """Far more than a sample ever gains from."""
@@ -166,15 +166,15 @@ class DiffusionHead(GaussianHead):
         memory: th.Tensor,
         embedding: th.Tensor,
         generator: th.Generator | None = None,
-    ) -> tuple[th.Tensor, Logs]:
+    ) -> tuple[th.Tensor, TensorLogs]:
         loss, logs = super().loss(posterior, prior, memory, embedding, generator)
         posterior, prior = (Gaussian(*(field.detach().flatten(end_dim=-4) for field in each)) for each in (posterior, prior))
         memory, embedding = (field.detach().flatten(end_dim=-4) for field in (memory, embedding))
         residual = posterior.mean - prior.mean
         self._gauges = self._gauge(posterior, prior, residual, memory, generator)
         diffusion = self._denoising_loss(residual, memory, embedding, generator)
-        scales = {"residual_scale": self.residual_scale.item(), "diffusion_advantage": self.advantage.item()}
-        return loss + diffusion, {**logs, "diffusion_loss": diffusion.item(), **scales}
+        scales = {"residual_scale": self.residual_scale.clone(), "diffusion_advantage": self.advantage.clone()}
+        return loss + diffusion, {**logs, "diffusion_loss": diffusion.detach(), **scales}
 
     def settle(self) -> None:
         if self._gauges is None:

@@ -7,7 +7,7 @@ from typing import ClassVar
 import torch as th
 from torch import nn
 
-from sb3_esad.common.type_aliases import Logs
+from sb3_esad.common.type_aliases import TensorLogs
 
 
 class EntropyCoefficient(nn.Module, ABC):
@@ -25,7 +25,7 @@ class EntropyCoefficient(nn.Module, ABC):
         """
 
     @abstractmethod
-    def update(self, log_prob: th.Tensor) -> Logs:
+    def update(self, log_prob: th.Tensor) -> TensorLogs:
         """
         Adapt to the entropy of the policy.
 
@@ -52,8 +52,8 @@ class FixedCoefficient(EntropyCoefficient):
     def forward(self) -> th.Tensor:
         return self.value
 
-    def update(self, log_prob: th.Tensor) -> Logs:
-        return {"ent_coef": self.value.item()}
+    def update(self, log_prob: th.Tensor) -> TensorLogs:
+        return {"ent_coef": self.value.detach()}
 
 
 class LearnedCoefficient(EntropyCoefficient):
@@ -86,7 +86,7 @@ class LearnedCoefficient(EntropyCoefficient):
     def forward(self) -> th.Tensor:
         return self.log_coefficient.detach().exp()
 
-    def update(self, log_prob: th.Tensor) -> Logs:
+    def update(self, log_prob: th.Tensor) -> TensorLogs:
         excess = -log_prob.detach().mean() - self.target_entropy
         # The logarithm, as in SB3, not the coefficient itself: a small coefficient would hardly ever recover.
         loss = self.log_coefficient * excess
@@ -95,7 +95,7 @@ class LearnedCoefficient(EntropyCoefficient):
         self.optimizer.step()
         with th.no_grad():
             self.log_coefficient.clamp_(*self.log_bounds)
-        return {"ent_coef": self().item(), "ent_coef_loss": loss.item()}
+        return {"ent_coef": self(), "ent_coef_loss": loss.detach()}
 
 
 def make_entropy_coefficient(ent_coef: str | float, target_entropy: float, learning_rate: float = 3e-4) -> EntropyCoefficient:

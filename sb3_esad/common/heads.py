@@ -7,7 +7,7 @@ from torch.nn.functional import binary_cross_entropy_with_logits
 from sb3_esad.common.functional import correct_logit
 from sb3_esad.common.torch_layers import GridReadout, GridShape, SparseReadout, mlp
 from sb3_esad.common.transforms import symexp, twohot_decode, twohot_encode
-from sb3_esad.common.type_aliases import Logs, Predictions
+from sb3_esad.common.type_aliases import Predictions, TensorLogs
 
 
 class ValueDistribution(nn.Module):
@@ -80,7 +80,7 @@ class PredictionHeads(nn.Module):
         cost = correct_logit(cost, self.cost_weight)
         return Predictions(self.distribution.mean(reward), cost.sigmoid(), going_on.sigmoid())
 
-    def loss(self, grid: th.Tensor, targets: Predictions, event_weights: th.Tensor) -> tuple[th.Tensor, Logs]:
+    def loss(self, grid: th.Tensor, targets: Predictions, event_weights: th.Tensor) -> tuple[th.Tensor, TensorLogs]:
         """
         Fit the heads to what was recorded.
 
@@ -100,7 +100,7 @@ class PredictionHeads(nn.Module):
             ).mean(),
             "sparsity_loss": self.sparsity_weight * self.event_readout.price(),
         }
-        return th.stack(list(terms.values())).sum(), {name: term.item() for name, term in terms.items()}
+        return th.stack(list(terms.values())).sum(), {name: term.detach() for name, term in terms.items()}
 
     def _logits(self, grid: th.Tensor) -> tuple[th.Tensor, th.Tensor, th.Tensor]:
         events = self.event_readout(grid)

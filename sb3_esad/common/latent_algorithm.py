@@ -21,7 +21,7 @@ from sb3_esad.common.schedules import HoldThenFall
 from sb3_esad.common.side_by_side import side_by_side
 from sb3_esad.common.starts import choose_starts
 from sb3_esad.common.target_networks import update_target
-from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
+from sb3_esad.common.type_aliases import Imagination, LatentState, SequenceSamples, TensorLogs
 
 FALLING_RATE = HoldThenFall(start=0.006, hold=0.5)
 """A constant rate, large enough to learn, swings between driving too fast and crawling (docs/experiments.md, section 5)."""
@@ -103,14 +103,14 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
             gradient_steps += self.pretrain_gradient_steps
             for _ in range(self.pretrain_steps):
                 self._update_world_model(self._sample(batch_size))
-        logs: dict[str, list[float]] = defaultdict(list)
+        logs: dict[str, list[th.Tensor]] = defaultdict(list)
         for update_logs in self._updates(gradient_steps, batch_size):
             for name, value in update_logs.items():
                 logs[name].append(value)
         self._n_updates += gradient_steps
         self._record(logs)
 
-    def _updates(self, n: int, batch_size: int) -> Iterator[Logs]:
+    def _updates(self, n: int, batch_size: int) -> Iterator[TensorLogs]:
         """
         Update model and behaviour in turns.
 
@@ -128,7 +128,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
         yield {**model_logs, **self._learn_behavior(samples, filtered)}
 
     @abstractmethod
-    def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
+    def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> TensorLogs:
         """
         Improve actor and critics.
 
@@ -141,20 +141,20 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _sample(self, batch_size: int) -> SequenceSamples:
         return self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
 
-    def _learn_behavior(self, samples: SequenceSamples, filtered: Filtered) -> Logs:
+    def _learn_behavior(self, samples: SequenceSamples, filtered: Filtered) -> TensorLogs:
         with autocast(self.device):
             return self._update_behavior(samples, filtered, self._imagine(samples, filtered))
 
-    def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, Logs]:
+    def _update_world_model(self, samples: SequenceSamples) -> tuple[Filtered, TensorLogs]:
         filtered, logs = self._fitting(samples)()
         logs["world_model/grad_norm"] = self._move_world_model()
         return filtered, logs
 
-    def _fitting(self, samples: SequenceSamples) -> Callable[[], tuple[Filtered, Logs]]:
+    def _fitting(self, samples: SequenceSamples) -> Callable[[], tuple[Filtered, TensorLogs]]:
         """Draw what is random about a gradient of the world model, and give the job that computes it."""
         generator = th.Generator(self.device).manual_seed(int(th.randint(2**62, ()).item()))
 
-        def fit() -> tuple[Filtered, Logs]:
+        def fit() -> tuple[Filtered, TensorLogs]:
             with autocast(self.device):
                 loss, filtered, logs = self.policy.world_model.loss(samples, generator)
             differentiate(loss, self.policy.world_model.optimizer)
@@ -162,18 +162,18 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
 
         return fit
 
-    def _step(self, name: str, loss: th.Tensor) -> float:
+    def _step(self, name: str, loss: th.Tensor) -> th.Tensor:
         """Minimise a loss by one step of one network; whatever else it passed through stays."""
         differentiate(loss, getattr(self.policy, name).optimizer)
         return self._move(name)
 
-    def _move(self, name: str) -> float:
+    def _move(self, name: str) -> th.Tensor:
         """Move a network against its gradient, and its target after it."""
         network = getattr(self.policy, name)
         norm = th.nn.utils.clip_grad_norm_(network.parameters(), self.max_grad_norm)
         network.optimizer.step()
         update_target(network, getattr(self.policy, f"{name}_target"), self.tau)
-        return norm.item()
+        return norm
 
     def _imagine(self, samples: SequenceSamples, filtered: Filtered) -> Imagination:
         start = choose_starts(samples, filtered, self.imagination_starts)
@@ -183,7 +183,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
     def _first_actions(self, start: LatentState) -> th.Tensor:
         return self.policy.actor(self.policy.world_model.features(start))
 
-    def _move_world_model(self) -> float:
+    def _move_world_model(self) -> th.Tensor:
         norm = self._move("world_model")
         self.policy.world_model.rssm.head.settle()
         return norm

@@ -7,7 +7,7 @@ import torch as th
 from torch import nn
 
 from sb3_esad.common.torch_layers import ChannelNorm, GridShape, SameConv2d, conv_block, kernel_size
-from sb3_esad.common.type_aliases import Logs
+from sb3_esad.common.type_aliases import TensorLogs
 
 MIN_STD = 0.1
 
@@ -112,7 +112,7 @@ class LatentHead(nn.Module, ABC):
         memory: th.Tensor,
         embedding: th.Tensor,
         generator: th.Generator | None = None,
-    ) -> tuple[th.Tensor, Logs]:
+    ) -> tuple[th.Tensor, TensorLogs]:
         """
         Fit prior and posterior to each other, and whatever else the head draws its latents with.
 
@@ -194,12 +194,12 @@ class GaussianHead(LatentHead):
         memory: th.Tensor,
         embedding: th.Tensor,
         generator: th.Generator | None = None,
-    ) -> tuple[th.Tensor, Logs]:
+    ) -> tuple[th.Tensor, TensorLogs]:
         dynamics = kl_divergence(posterior.detach(), prior)
         representation = kl_divergence(posterior, prior.detach())
         terms = (dynamics, representation)
         loss = sum(scale * kl.clamp(min=self.free_nats).mean() for scale, kl in zip(self.scales, terms, strict=True))
-        return th.as_tensor(loss), {"kl": dynamics.mean().item()}
+        return th.as_tensor(loss), {"kl": dynamics.mean().detach()}
 
     @staticmethod
     def _gaussian(parameters: th.Tensor) -> Gaussian:

@@ -1,9 +1,11 @@
 """Groups of what is logged; docs/watching.md explains every key."""
 
-from sb3_esad.common.type_aliases import Logs
+from typing import TypeVar
+
+Value = TypeVar("Value")
 
 
-def grouped(group: str, logs: Logs) -> Logs:
+def grouped(group: str, logs: dict[str, Value]) -> dict[str, Value]:
     """
     Put values into a group.
 

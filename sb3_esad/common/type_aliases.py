@@ -7,6 +7,8 @@ import torch as th
 from stable_baselines3.common.type_aliases import TensorDict
 
 Logs = dict[str, float]
+TensorLogs = dict[str, th.Tensor]
+"""Scalars without gradient on the device of the networks: to read one in the midst of an update is to wait for a GPU."""
 
 NO_EVENT = 2**31 - 1
 """In ``SequenceSamples.time_to_event``: no cost follows."""

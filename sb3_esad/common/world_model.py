@@ -17,7 +17,7 @@ from sb3_esad.common.precision import working_dtype
 from sb3_esad.common.preprocessing import Observations, Preprocessing, by_key, map_observations
 from sb3_esad.common.rssm import RSSM, Filtered
 from sb3_esad.common.torch_layers import LearningModule, join
-from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, Predictions, SequenceSamples
+from sb3_esad.common.type_aliases import Imagination, LatentState, Predictions, SequenceSamples, TensorLogs
 
 
 class WorldModel(LearningModule):
@@ -184,7 +184,7 @@ class WorldModel(LearningModule):
         """
         return self.preprocessing.invert({key: head(grids) for key, head in self._observation_heads()})
 
-    def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, Logs]:
+    def loss(self, samples: SequenceSamples, generator: th.Generator | None = None) -> tuple[th.Tensor, Filtered, TensorLogs]:
         """
         Fit the model to windows of recorded steps, and take note of the scale of vectors.
 
@@ -208,7 +208,7 @@ class WorldModel(LearningModule):
         observation_losses = [head.loss(grid[some], seen[key]) for key, head in self._observation_heads()]
         observation_loss = th.stack(observation_losses).sum()
         loss = observation_loss + prediction_loss + head_loss
-        return loss, filtered, {**logs, **head_logs, "observation_loss": observation_loss.item()}
+        return loss, filtered, {**logs, **head_logs, "observation_loss": observation_loss.detach()}
 
     def _withhold(self, steps: th.Tensor, generator: th.Generator | None = None) -> th.Tensor:
         # Every window hides one stretch, so that the prior is trained on what it will be used for: going on alone

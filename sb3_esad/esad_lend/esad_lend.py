@@ -17,7 +17,7 @@ from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
-from sb3_esad.common.type_aliases import Imagination, LatentState, Logs, SequenceSamples
+from sb3_esad.common.type_aliases import Imagination, LatentState, SequenceSamples, TensorLogs
 from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
     Transitions,
@@ -119,7 +119,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         explore = th.rand(len(actions), 1, device=actions.device) < self.uniform_action_prob
         return th.where(explore, 2 * th.rand_like(actions) - 1, actions)
 
-    def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> Logs:
+    def _update_behavior(self, samples: SequenceSamples, filtered: Filtered, imagined: Imagination) -> TensorLogs:
         recorded, fixed = recorded_transitions(self.policy, samples, filtered), imagined.detach()
         return {
             **self._update_critic(fixed, recorded),
@@ -127,7 +127,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
             **self._update_actor(imagined),
         }
 
-    def _update_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
+    def _update_critic(self, imagined: Imagination, recorded: Transitions) -> TensorLogs:
         critic, target = self.policy.critic, self.policy.critic_target
         with th.no_grad():
             targets = imagined_returns(target, imagined, self.gamma, self.lambda_return)
@@ -137,23 +137,23 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         anchored = (recorded.event_weights * critic.loss(recorded.grids, recorded.actions, recorded_targets)).mean()
         self._step("critic", dreamed + self.replay_critic_coef * anchored)
         return {
-            "critic_loss": dreamed.item(),
-            "replay_critic_loss": anchored.item(),
-            "imagination/return": targets[0].mean().item(),
-            "imagination/reward": imagined.predictions.rewards.mean().item(),
+            "critic_loss": dreamed.detach(),
+            "replay_critic_loss": anchored.detach(),
+            "imagination/return": targets[0].mean().detach(),
+            "imagination/reward": imagined.predictions.rewards.mean().detach(),
         }
 
-    def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> Logs:
+    def _update_cost_critic(self, imagined: Imagination, recorded: Transitions) -> TensorLogs:
         targets = self._imagined_cost_targets(imagined, self._raise_cost_bound())
         dreamed = self._imagined_cost_losses(imagined, targets)
         anchored = self._recorded_cost_losses(recorded, self.replay_lambda)
         self._step("cost_critic", dreamed.sum() + self.replay_cost_critic_coef * anchored.sum())
         return {
-            "cost_critic_loss": dreamed[0].item(),
-            "cost_var_loss": dreamed[1].item(),
-            "replay_cost_critic_loss": anchored[0].item(),
-            "replay_cost_var_loss": anchored[1].item(),
-            "imagination/cost": targets.means[0].mean().item(),
+            "cost_critic_loss": dreamed[0].detach(),
+            "cost_var_loss": dreamed[1].detach(),
+            "replay_cost_critic_loss": anchored[0].detach(),
+            "replay_cost_var_loss": anchored[1].detach(),
+            "imagination/cost": targets.means[0].mean().detach(),
         }
 
     def _imagined_cost_targets(self, imagined: Imagination, continue_after_cost: float) -> CostTargets:
@@ -213,7 +213,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
                     loss = loss + imagined_coef * self._imagined_cost_losses(imagined, targets).sum()
                 self._step("cost_critic", loss)
 
-    def _update_actor(self, imagined: Imagination) -> Logs:
+    def _update_actor(self, imagined: Imagination) -> TensorLogs:
         """
         Improve the actor by the gradient of imagined returns and costs, back through all the steps that lead to them.
 
@@ -229,11 +229,11 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         self._step("actor", loss)
         usual_risk = risk[0, : risk.shape[1] // 2]  # the other half starts shortly before a cost
         return {
-            "actor_loss": loss.item(),
-            "imagination/risk": usual_risk.mean().item(),
-            "imagination/barrier_residual": barrier.relu().mean().item(),
-            "entropy": -log_prob.mean().item(),
-            "return_scale": self.policy.critic.scale.item(),
+            "actor_loss": loss.detach(),
+            "imagination/risk": usual_risk.mean().detach(),
+            "imagination/barrier_residual": barrier.relu().mean().detach(),
+            "entropy": -log_prob.mean().detach(),
+            "return_scale": self.policy.critic.scale.clone(),
             **self.entropy.update(log_prob.detach()),
         }
 

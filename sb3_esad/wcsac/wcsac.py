@@ -15,7 +15,7 @@ from sb3_esad.common.cost_limited_algorithm import CostLimitedAlgorithm
 from sb3_esad.common.functional import rising_cvar
 from sb3_esad.common.optimizers import differentiate
 from sb3_esad.common.target_networks import update_target
-from sb3_esad.common.type_aliases import CostReplaySamples, Logs
+from sb3_esad.common.type_aliases import CostReplaySamples, TensorLogs
 from sb3_esad.wcsac.policies import CnnPolicy, MlpPolicy, MultiInputPolicy, WCSACPolicy
 
 
@@ -76,7 +76,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
             return
         self.policy.set_training_mode(True)
         self._update_learning_rate(self._optimizers())
-        logs: dict[str, list[float]] = defaultdict(list)
+        logs: dict[str, list[th.Tensor]] = defaultdict(list)
         for step in range(gradient_steps):
             samples: Any = self.replay_buffer.sample(batch_size, env=self._vec_normalize_env)
             for name, value in self._update(samples).items():
@@ -87,7 +87,7 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         self._n_updates += gradient_steps
         self._record(logs)
 
-    def _update(self, samples: CostReplaySamples) -> Logs:
+    def _update(self, samples: CostReplaySamples) -> TensorLogs:
         if self.use_sde:
             self.actor.reset_noise()
         # The actions are drawn in SAC's order, and before anything has been learned from the batch
@@ -102,18 +102,18 @@ class WCSAC(CostLimitedAlgorithm, SAC):
             **self._update_actor(samples.observations, actions, ent_coef * log_prob[:, None]),
         }
 
-    def _update_ent_coef(self, log_prob: th.Tensor) -> tuple[th.Tensor, Logs]:
+    def _update_ent_coef(self, log_prob: th.Tensor) -> tuple[th.Tensor, TensorLogs]:
         """The coefficient before its update, as SAC uses it, and what to log."""
         if self.ent_coef_optimizer is None or self.log_ent_coef is None:
-            return self.ent_coef_tensor, {"ent_coef": self.ent_coef_tensor.item()}
+            return self.ent_coef_tensor, {"ent_coef": self.ent_coef_tensor.detach()}
         ent_coef = self.log_ent_coef.detach().exp()
         loss = -(self.log_ent_coef * (log_prob.detach() + float(self.target_entropy))).mean()
         self.ent_coef_optimizer.zero_grad()
         loss.backward()
         self.ent_coef_optimizer.step()
-        return ent_coef, {"ent_coef": ent_coef.item(), "ent_coef_loss": loss.item()}
+        return ent_coef, {"ent_coef": ent_coef.detach(), "ent_coef_loss": loss.detach()}
 
-    def _update_critic(self, samples: CostReplaySamples, next_actions: th.Tensor, entropy_term: th.Tensor) -> Logs:
+    def _update_critic(self, samples: CostReplaySamples, next_actions: th.Tensor, entropy_term: th.Tensor) -> TensorLogs:
         with th.no_grad():
             next_values = th.cat(self.critic_target(samples.next_observations, next_actions), dim=1)
             next_value = next_values.min(dim=1, keepdim=True).values - entropy_term
@@ -121,24 +121,24 @@ class WCSAC(CostLimitedAlgorithm, SAC):
         values = self.critic(samples.observations, samples.actions)
         loss = 0.5 * th.stack([F.mse_loss(value, targets) for value in values]).sum()
         self._minimize(loss, self.critic.optimizer)
-        return {"critic_loss": loss.item()}
+        return {"critic_loss": loss.detach()}
 
-    def _update_cost_critic(self, samples: CostReplaySamples, next_actions: th.Tensor) -> Logs:
+    def _update_cost_critic(self, samples: CostReplaySamples, next_actions: th.Tensor) -> TensorLogs:
         self._raise_cost_bound()
         taken, reached = (samples.observations, samples.actions), (samples.next_observations, next_actions)
         costs, continues = samples.costs.flatten(), 1 - samples.dones.flatten()
         targets = self.policy.cost_critic_target.targets(taken, reached, costs, continues, self.discount_of_cost)
         mean_loss, variance_loss = self.policy.cost_critic.loss(*taken, *targets)
         self._minimize((mean_loss + variance_loss).mean(), self.policy.cost_critic.optimizer)
-        return {"cost_critic_loss": mean_loss.mean().item(), "cost_var_loss": variance_loss.mean().item()}
+        return {"cost_critic_loss": mean_loss.mean().detach(), "cost_var_loss": variance_loss.mean().detach()}
 
-    def _update_actor(self, observations: PyTorchObs, actions: th.Tensor, entropy_term: th.Tensor) -> Logs:
+    def _update_actor(self, observations: PyTorchObs, actions: th.Tensor, entropy_term: th.Tensor) -> TensorLogs:
         value = th.cat(self.critic(observations, actions), dim=1).min(dim=1, keepdim=True).values
         means, variance = self.policy.cost_critic(observations, actions)
         risk = rising_cvar(means, variance, self.risk_level).max(0).values[:, None]
         loss = self.penalty.combine(entropy_term - value, risk, th.zeros_like(risk)).mean()
         self._minimize(loss, self.actor.optimizer)
-        return {"actor_loss": loss.item(), "safety/replayed_risk": risk.mean().item()}
+        return {"actor_loss": loss.detach(), "safety/replayed_risk": risk.mean().detach()}
 
     @staticmethod
     def _minimize(loss: th.Tensor, optimizer: th.optim.Optimizer) -> None:
