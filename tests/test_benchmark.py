@@ -51,6 +51,7 @@ def test_a_learning_curve_has_one_point_at_the_end_and_all_costs(
     model = SAC("MlpPolicy", CountingEnv(), learning_starts=100, buffer_size=100, train_freq=4)
     model.set_logger(configure(str(tmp_path / "curve"), ["csv"]))
     model.learn(total, callback=curve)
+    model.logger.close()
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
     assert [line["steps"] for line in lines] == steps
     assert lines[-1]["cost_steps"] == [step for step in (3, 6, 10, 13, 17, 20) if step <= total]
