@@ -42,8 +42,8 @@ SMALL_POLICY: dict[str, Any] = {"net_arch": [16], "memory_channels": 8, "latent_
 """What makes those that imagine quick."""
 
 OF_TQC = ("n_quantiles",)
-OF_SAC = ("n_critics", "share_features_extractor", "features_extractor_kwargs")
-"""What describes networks that ours are not: dropped, but in the test that is about the number of critics."""
+OF_SAC = ("share_features_extractor", "features_extractor_kwargs")
+"""What describes networks that ours are not: dropped."""
 
 DOES_NOT_APPLY: dict[str, str] = {
     r"test_her\.py|test_vec_normalize\.py::test_her": "HerReplayBuffer keeps no costs, and is refused",
@@ -59,7 +59,6 @@ DOES_NOT_APPLY: dict[str, str] = {
 DOES_NOT_APPLY_TO_LATENTS: dict[str, str] = {
     r"test_sde\.py.*(True-True|True-False)|test_run\.py::test_sde|test_spaces\.py::test_sde": "gSDE is refused",
     r"stable_baselines3/.*::test_offpolicy_multi_env": "asks for gSDE; that of sb3-contrib does not, and passes",
-    r"test_run\.py::test_n_critics": "n_critics is no argument of the policy: there are two",
     r"test_save_load\.py::test_save_load_policy": "calls actor.predict: an actor of ours sees latent states, not observations",
     r"test_save_load\.py::test_save_load_pytorch_var": "reads log_ent_coef; ours is a module named entropy",
     r"test_gae\.py": "calls the critic with observations; ours sees latent states",
@@ -113,14 +112,13 @@ class StandIn:
 
     def __init__(self, algorithm: type[Any], package: str) -> None:
         self.package, self.taken = package, TAKEN[package]
-        self.as_it_stands = False
-        plugin, is_latent = self, issubclass(algorithm, ESADLEND)
+        is_latent = issubclass(algorithm, ESADLEND)
+        dropped = OF_TQC + OF_SAC if is_latent else OF_TQC
 
         class Small(algorithm):
             """The algorithm with small networks, whatever sizes a test knows of."""
 
             def __init__(self, *args: Any, policy_kwargs: dict[str, Any] | None = None, **kwargs: Any) -> None:
-                dropped = OF_TQC if plugin.as_it_stands or not is_latent else OF_TQC + OF_SAC
                 own = {name: value for name, value in (policy_kwargs or {}).items() if name not in dropped}
                 if is_latent:
                     kwargs, own = {**SMALL, **kwargs}, {**SMALL_POLICY, **own}
@@ -145,14 +143,6 @@ class StandIn:
         for item in items:
             if reason := reason_of(f"{self.package}/{item.nodeid}", self.algorithm):
                 item.add_marker(pytest.mark.xfail(reason=reason, strict=True))
-
-    def pytest_runtest_setup(self, item: pytest.Function) -> None:
-        """
-        Take the test's own networks where they are what it is about.
-
-        :param item: test that is about to run
-        """
-        self.as_it_stands = "test_n_critics" in item.name
 
     def _is_meant(self, item: pytest.Function) -> bool:
         params = item.callspec.params if hasattr(item, "callspec") else {}

@@ -597,6 +597,15 @@ def test_the_networks_have_the_names_that_sac_gives_them(tmp_path: Path) -> None
         assert each.critic is each.policy.critic and each.critic_target is each.policy.critic_target
 
 
+def test_the_policy_has_as_many_critics_as_it_is_told_to(tmp_path: Path) -> None:
+    model = make_model(policy_kwargs={**TINY["policy_kwargs"], "n_critics": 3}).learn(24)
+    model.save(tmp_path / "model")
+    for policy in (model.policy, ESADLEND.load(tmp_path / "model").policy):
+        assert len(policy.critic.q_networks) == len(policy.cost_critic.means) == 3
+    with pytest.raises(ValueError, match="n_critics is 0; choose a number >= 1"):
+        make_model(policy_kwargs={**TINY["policy_kwargs"], "n_critics": 0})
+
+
 def test_a_frozen_features_extractor_is_left_as_it_is() -> None:
     model = make_model()
     extractor = model.policy.world_model.features_extractor.requires_grad_(False)

@@ -39,6 +39,7 @@ class LatentPolicy(BasePolicy):
     :param action_space: box of the actions
     :param lr_schedule: learning rate of all networks
     :param net_arch: hidden layers of actor and critics, or of each in a dictionary with ``pi`` and ``qf``; at least one
+    :param n_critics: size of the ensembles of critics, for the return and for the mean of the cost
     :param memory_channels: channels of the memory in each cell; None for 32 on a grid and 256 for vectors
     :param latent_channels: channels of the stochastic latent in each cell; None for 8 on a grid and 32 for vectors
     :param world_model_kwargs: further arguments of the world model
@@ -62,6 +63,7 @@ class LatentPolicy(BasePolicy):
         action_space: spaces.Box,
         lr_schedule: Schedule,
         net_arch: list[int] | dict[str, list[int]] | None = None,
+        n_critics: int = 2,
         memory_channels: int | None = None,
         latent_channels: int | None = None,
         world_model_kwargs: dict[str, Any] | None = None,
@@ -89,8 +91,10 @@ class LatentPolicy(BasePolicy):
         self.actor_arch, self.critic_arch = get_actor_critic_arch(self.net_arch)
         complete = len(self.actor_arch) > 0 and len(self.critic_arch) > 0
         require(complete, "net_arch", net_arch, "at least one hidden layer for the actor and for the critics")
+        require(n_critics >= 1, "n_critics", n_critics, "a number >= 1")
         for name, channels in (("memory_channels", memory_channels), ("latent_channels", latent_channels)):
             require(channels is None or channels >= 1, name, channels, "a number >= 1, or None for the usual one")
+        self.n_critics = n_critics
         self.memory_channels = memory_channels
         self.latent_channels = latent_channels
         self.world_model_kwargs = world_model_kwargs or {}
@@ -103,8 +107,9 @@ class LatentPolicy(BasePolicy):
         rssm = self.world_model.rssm
         grid = (rssm.memory_shape[0] + rssm.latent_shape[0], *rssm.memory_shape[1:])
         self.actor = Actor(grid, rssm.action_dim, self.actor_arch)
-        self.critic = QEnsemble(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
-        self.cost_critic = self.cost_critic_class(GridReadout(grid, self.critic_arch[0]), rssm.action_dim, self.critic_arch)
+        critics = (rssm.action_dim, self.critic_arch, self.n_critics)
+        self.critic = QEnsemble(GridReadout(grid, self.critic_arch[0]), *critics)
+        self.cost_critic = self.cost_critic_class(GridReadout(grid, self.critic_arch[0]), *critics)
         self.world_model_target, self.actor_target = make_target(self.world_model), make_target(self.actor)
         self.critic_target, self.cost_critic_target = make_target(self.critic), make_target(self.cost_critic)
         self.to(memory_format=th.channels_last)  # type: ignore[call-overload]  # torch's stub does not know the keyword
@@ -242,6 +247,7 @@ class LatentPolicy(BasePolicy):
             **super()._get_constructor_parameters(),
             "lr_schedule": self._dummy_schedule,
             "net_arch": self.net_arch,
+            "n_critics": self.n_critics,
             "memory_channels": self.memory_channels,
             "latent_channels": self.latent_channels,
             "world_model_kwargs": self.world_model_kwargs,
