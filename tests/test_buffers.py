@@ -229,7 +229,7 @@ def test_known_weights() -> None:
 @pytest.mark.parametrize(("fraction", "recency"), [(0.25, 0.0), (0.5, 0.0), (0.5, 3.0)])
 def test_weights_are_unbiased(fraction: float, recency: float) -> None:
     env = make_env(2)
-    buffer = make_buffer(env, size=400, length=8, event_fraction=fraction, recency=recency, recency_steps=1)
+    buffer = make_buffer(env, size=400, length=8, event_fraction=fraction, recency=recency)
     add_costs(buffer, np.ones((7, 2)))  # of which nothing is left
     costs = (np.random.rand(200, 2) < np.linspace(0.03, 0.0, 200)[:, None]) * np.random.rand(200, 2)
     add_costs(buffer, costs)
@@ -262,20 +262,13 @@ def test_what_is_newer_is_drawn_more_often() -> None:
 
 
 def test_a_wrapped_buffer_knows_what_is_new() -> None:
-    buffer = make_buffer(make_env(), size=50, length=5, recency=20.0, recency_steps=1)
+    buffer = make_buffer(make_env(), size=50, length=5, recency=20.0)
     add_costs(buffer, np.zeros((127, 1)))
     assert (buffer.sample(64).observations > 110).float().mean() > 0.9
 
 
-def test_what_is_in_a_young_buffer_is_not_old() -> None:
-    buffer = make_buffer(make_env(2), size=400, length=5, recency=3.0, recency_steps=200)
-    for steps, expected in ((20, 0.6), (50, 2.1), (100, 3.0), (100, 3.0)):
-        add_costs(buffer, np.zeros((steps, 2)))
-        assert buffer._index(5).recency == pytest.approx(expected)
-
-
 def test_another_recency_counts_at_once() -> None:
-    buffer = make_buffer(make_env(), size=200, length=5, recency=100.0, recency_steps=1)
+    buffer = make_buffer(make_env(), size=200, length=5, recency=100.0)
     add_costs(buffer, np.zeros((200, 1)))
     assert (buffer.sample(64).observations > 150).all()
     buffer.recency = 0.0
@@ -495,7 +488,6 @@ def test_search_for_events_is_fast_with_many_steps() -> None:
         ({"event_fraction": 1.0}, "event_fraction is 1.0"),
         ({"recency": -1.0}, "recency is -1.0"),
         ({"recency": 101.0}, "recency is 101.0"),
-        ({"recency_steps": 0}, "recency_steps is 0"),
     ],
 )
 def test_refuses_what_it_cannot_do(kwargs: dict[str, Any], message: str) -> None:

@@ -42,8 +42,6 @@ class SequenceReplayBuffer(CostBuffer):
     :param event_fraction: share of a batch drawn among windows with a cost, in [0, 1)
     :param recency: in [0, 100]; the probability of a window grows by e to this power from the beginning of the buffer to its
         end, 0 if all are equally likely
-    :param recency_steps: stored steps from which on it does so, by a power in proportion before: what is in a young buffer
-        is not old, and its crashes are few
     :param kwargs: see :class:`CostBuffer`
     :raises ValueError: if an argument cannot be honoured
     """
@@ -58,17 +56,14 @@ class SequenceReplayBuffer(CostBuffer):
         sequence_length: int = 16,
         event_fraction: float = 0.5,
         recency: float = 3.0,
-        recency_steps: int = 20_000,
         **kwargs: Any,
     ) -> None:
         super().__init__(buffer_size, observation_space, action_space, device, n_envs, **kwargs)
         _check(self.buffer_size, sequence_length, event_fraction)
         require(0 <= recency <= 100, "recency", recency, "a number from 0 to 100")
-        require(recency_steps >= 1, "recency_steps", recency_steps, "a number of steps >= 1")
         self.sequence_length = sequence_length
         self.event_fraction = event_fraction
         self.recency = recency
-        self.recency_steps = recency_steps
         self._windows: WindowIndex | None = None
 
     def take_settings_of(self, other: CostBuffer) -> None:
@@ -80,8 +75,7 @@ class SequenceReplayBuffer(CostBuffer):
         super().take_settings_of(other)
         assert isinstance(other, SequenceReplayBuffer)
         self.sequence_length = other.sequence_length
-        self.event_fraction = other.event_fraction
-        self.recency, self.recency_steps = other.recency, other.recency_steps
+        self.event_fraction, self.recency = other.event_fraction, other.recency
 
     def __getstate__(self) -> dict[str, Any]:
         return {**super().__getstate__(), "_windows": None}
@@ -139,9 +133,8 @@ class SequenceReplayBuffer(CostBuffer):
     def _index(self, length: int) -> WindowIndex:
         """The windows of that length; drawn from again and again, until there are new steps or other settings."""
         known = self._windows
-        recency = self.recency * min(1.0, self.size() * self.n_envs / self.recency_steps)
-        if known is None or (known.length, known.recency) != (length, recency):
-            known = self._windows = WindowIndex(self._events_in_order(), length, recency)
+        if known is None or (known.length, known.recency) != (length, self.recency):
+            known = self._windows = WindowIndex(self._events_in_order(), length, self.recency)
         return known
 
     def _events_in_order(self) -> np.ndarray:
