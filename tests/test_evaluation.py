@@ -278,9 +278,9 @@ def test_what_is_explained_is_what_is_done(model: ESADLEND) -> None:
     ("risk", "intervened", "helpless", "words", "label"),
     [
         (np.nan, False, False, "Filter: at rest, for its critics are not trusted", "mean of the futures"),
-        (0.001, False, False, "Filter: the actor's own action", "as the filter judged the actor's, at most 1.00 %"),
-        (0.3, True, False, "Filter: another action taken", "as the filter judged the actor's, at most 1.00 %"),
-        (0.3, True, True, "Filter: nothing is safe, least risk taken", "as the filter judged the actor's, at most 1.00 %"),
+        (0.001, False, False, "Filter: the actor's own action", "as the filter judged the actor's"),
+        (0.3, True, False, "Filter: another action taken", "as the filter judged the actor's"),
+        (0.3, True, True, "Filter: nothing is safe, least risk taken", "as the filter judged the actor's"),
     ],
 )
 def test_the_film_tells_what_the_filter_has_done(

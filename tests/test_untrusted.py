@@ -97,7 +97,19 @@ def test_both_ways_lead_to_the_same_model(policy: str) -> None:
     for loaded in (mine, theirs, stock):
         np.testing.assert_array_equal(actions_of(loaded), actions_of(model))
     run = {"_last_obs", "_last_episode_starts", "_last_original_obs", "ep_info_buffer", "ep_success_buffer"}
-    built = {"policy", "penalty", "entropy", "replay_buffer", "lr_schedule", "_episode_costs", "_images", "_selections"}
+    built = {
+        "policy",
+        "actor",
+        "critic",
+        "critic_target",
+        "penalty",
+        "entropy",
+        "replay_buffer",
+        "lr_schedule",
+        "_episode_costs",
+        "_images",
+        "_selections",
+    }
     for name in vars(theirs).keys() - run - built:
         assert getattr(mine, name) == getattr(theirs, name), name
 
