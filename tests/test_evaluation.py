@@ -297,6 +297,7 @@ def test_the_film_tells_what_the_filter_has_done(
     panels, gauges = shown
     assert words in panels
     (gauge,) = (each for each in gauges if each.label.startswith(label))
+    assert np.isnan(risk) or gauge.label.endswith(f"at most {100 * driver.model.penalty.budget_scale:.2f} %")
     assert np.isnan(risk) or gauge.text == f"{100 * risk:.1f} %"
 
 

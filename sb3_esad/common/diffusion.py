@@ -103,7 +103,7 @@ class DiffusionHead(GaussianHead):
         **kwargs: Any,
     ) -> None:
         super().__init__(memory_shape, embedding_channels, latent_channels, hidden_channels, **kwargs)
-        few = f"a number of steps from 1 to {MOST_STEPS}, or 0 for a Gaussian latent"
+        few = f"a number of steps from 1 to {MOST_STEPS}, or a GaussianHead, which policies have with 0"
         require(1 <= diffusion_steps <= MOST_STEPS, "diffusion_steps", diffusion_steps, few)
         require(start_level > 0, "start_level", start_level, "a multiple > 0")
         self.diffusion_steps = diffusion_steps
