@@ -226,7 +226,7 @@ def make_head(
     **kwargs: Any,
 ) -> LatentHead:
     """
-    Build the latent head of ESAD-LEND: Gaussian, until more has been shown to help (docs/experiments.md, section 17).
+    Build the latent head of ESAD-LEND: Gaussian, until more has been shown to help (docs/experiments.md, section 24).
 
     :param memory_shape: shape of the memory (C, H, W)
     :param embedding_channels: channels of the observation's features
