@@ -27,7 +27,6 @@ TIMESTEPS, MINUTES = 20_000, 7.5
 FEW_UPDATES = {
     "learning_rate": FALLING_RATE,
     "train_freq": 32,
-    "learning_starts": 3_000,
     "pretrain_gradient_steps": 0,
     "replay_cost_critic_coef": 1.0,
     "replay_lambda": 0.0,

@@ -181,7 +181,6 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     monkeypatch.setattr(demo, "load_hyperparams", lambda *_: Hyperparams(60, 2, {**arguments, "imagination_starts": 8}))
     monkeypatch.setattr(demo, "ENV_ID", SHORT)
     monkeypatch.setattr(demo, "FIT_UPDATES", 2)
-    monkeypatch.setitem(demo.FEW_UPDATES, "learning_starts", 30)
     folder = tmp_path / "new" / "demo"
     brief = ["--timesteps", "60", "--episodes", "2"]
     assert main(["demo", "--out", str(folder), *brief, "--threads", "1", "--seed", "3"]) == 0
