@@ -23,7 +23,7 @@ from sb3_esad.report import Figures, format_table, summarise_any
 from sb3_esad.video import check_image, record_model, video_writer
 
 ENV_ID = "esad-highway-v0"
-TIMESTEPS, MINUTES = 20_000, 7.0
+TIMESTEPS, MINUTES = 20_000, 7.5
 FEW_UPDATES = {
     "learning_rate": FALLING_RATE,
     "train_freq": 32,
