@@ -161,7 +161,7 @@ class LearningCurve(BaseCallback):
 
     def _evaluate(self) -> None:
         self._seconds += time.monotonic() - self._resumed
-        line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds)}
+        line: dict[str, Any] = {"steps": self.num_timesteps, "seconds": round(self._seconds), "unseen": self.seeds[0]}
         line |= {"training_cost": self._cost, "training_episodes": self._episodes, "cost_steps": self._cost_steps}
         line["log"] = usual(self.path.with_suffix("") / "progress.csv", self._evaluated)
         self._evaluated = self.num_timesteps
@@ -183,7 +183,12 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--every", type=int, default=1500)
     parser.add_argument("--episodes", type=int, default=100)
-    parser.add_argument("--unseen", type=int, default=UNSEEN, help="first seed of the evaluation")
+    parser.add_argument(
+        "--unseen",
+        type=int,
+        default=UNSEEN,
+        help="first seed of the evaluation; to choose among settings take others, such as 500000 (default: %(default)s)",
+    )
     parser.add_argument("--threads", type=int, default=2)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--set", type=json.loads, default={}, help="JSON of constructor arguments to replace")

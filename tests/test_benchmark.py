@@ -47,13 +47,13 @@ def test_a_learning_curve_has_one_point_at_the_end_and_all_costs(
 ) -> None:
     monkeypatch.setattr(driving, "evaluate_model", lambda *args: [])
     monkeypatch.setattr(driving, "summarise", lambda records: {})
-    curve = driving.LearningCurve(tmp_path / "curve.jsonl", "CountingEnv", every=8, seeds=range(1))
+    curve = driving.LearningCurve(tmp_path / "curve.jsonl", "CountingEnv", every=8, seeds=range(7, 9))
     model = SAC("MlpPolicy", CountingEnv(), learning_starts=100, buffer_size=100, train_freq=4)
     model.set_logger(configure(str(tmp_path / "curve"), ["csv"]))
     model.learn(total, callback=curve)
     model.logger.close()
     lines = [json.loads(line) for line in (tmp_path / "curve.jsonl").read_text().splitlines()]
-    assert [line["steps"] for line in lines] == steps
+    assert [line["steps"] for line in lines] == steps and {line["unseen"] for line in lines} == {7}
     assert lines[-1]["cost_steps"] == [step for step in (3, 6, 10, 13, 17, 20) if step <= total]
 
 
