@@ -179,10 +179,9 @@ def test_wrong_options(words: str, message: str, capsys: pytest.CaptureFixture[s
 def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
     arguments = {"policy": "CnnPolicy", "policy_kwargs": TINY, "learning_starts": 30, "pretrain_steps": 1, "batch_size": 2}
     monkeypatch.setattr(demo, "load_hyperparams", lambda *_: Hyperparams(60, 2, {**arguments, "imagination_starts": 8}))
-    monkeypatch.setattr(demo, "ENV_ID", SHORT)
     monkeypatch.setattr(demo, "FIT_UPDATES", 2)
     folder = tmp_path / "new" / "demo"
-    brief = ["--timesteps", "60", "--episodes", "2"]
+    brief = ["--env", SHORT, "--timesteps", "60", "--episodes", "2"]
     assert main(["demo", "--out", str(folder), *brief, "--threads", "1", "--seed", "3"]) == 0
     files = {"esad_lend.zip", "learning_curve.png", "results.md", "episode.mp4"}
     assert {path.name for path in folder.iterdir()} == files
