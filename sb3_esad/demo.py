@@ -35,7 +35,8 @@ FEW_UPDATES = {
 """
 In hundreds of updates a rate that falls from the start moves the networks too little, and steps, which take hardly any time,
 teach more than updates: above all what a collision looks like (docs/experiments.md, sections 12 and 13). And when recorded
-costs counted for more one of three seeds was at 83 % without a collision, without that all were at 96 and more (sections 17 and 18).
+costs counted for more one of three seeds was at 83 % without a collision, without that all were at 96 and more (sections 17
+and 18).
 """
 FIT_UPDATES = 300
 """

@@ -2,6 +2,7 @@
 
 import ast
 from configparser import ConfigParser
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
@@ -85,6 +86,10 @@ def test_imports_point_down(path: Path) -> None:
             assert other == mine or mine not in ISOLATED or other not in ISOLATED, f"{path} imports {name}, its sibling."
             assert mine != "envs" or other == "envs", f"{path} imports {name}; a scenario stands alone."
         assert name.split(".")[0] != "rl_zoo3" or mine == "zoo", f"{path} imports rl_zoo3; leave that to zoo.py."
+
+
+def test_no_modules_import_each_other() -> None:
+    TopologicalSorter({module_name(path): imported(path) for path in MODULES}).prepare()
 
 
 @pytest.mark.parametrize("path", MODULES, ids=module_name)

@@ -7,7 +7,7 @@ import numpy as np
 
 from sb3_esad.envs.bev import DASH_GREY, LINE_GREY, OFF_ROUTE_GREY, ROUTE_GREY
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.scenario import Scenario
+from sb3_esad.envs.scene import Scene
 from sb3_esad.envs.users import Kind
 from sb3_esad.envs.view import Frame, Image, View
 
@@ -22,34 +22,34 @@ SLOW_COLOUR, FAST_COLOUR = np.array([60.0, 90.0, 170.0]), np.array([130.0, 200.0
 FASTEST = 30.0  # [m/s]
 
 
-def draw_scene(scenario: Scenario) -> Image:
+def draw_scene(scene: Scene) -> Image:
     """
     Draw the surroundings of the ego vehicle, its lane's direction to the right, with the figures that matter.
 
-    :param scenario: a scenario that was reset
+    :param scene: of a scenario that was reset
     :return: RGB picture, shape ``(320, 960, 3)``
     """
-    traffic, ground, stop_lines = scenario.traffic, scenario.ground, scenario.stop_lines
-    scale = scenario.config["metres_per_pixel"][0] / ZOOM
+    traffic, ground, stop_lines = scene.traffic, scene.ground, scene.stop_lines
+    scale = scene.config["metres_per_pixel"][0] / ZOOM
     view = View(SIZE, (scale, scale), AHEAD)
-    frame = Frame(view, traffic.position[EGO], float(traffic.heading[EGO]) - scenario.heading_error)
+    frame = Frame(view, traffic.position[EGO], float(traffic.heading[EGO]) - scene.heading_error)
     canvas = np.empty((*SIZE, 3), dtype=np.uint8)
     canvas[:] = GRASS
     shapes = frame.pixels(np.concatenate([ground.corners, stop_lines.corners, traffic.corners]))
     colours = [GROUND_COLOURS[grey] for grey in ground.greys.tolist()]
     colours += [RED if red else AMBER for red in stop_lines.red]
-    colours += [_colour(scenario, row) for row in range(len(traffic.corners))]
+    colours += [_colour(scene, row) for row in range(len(traffic.corners))]
     is_line = ground.is_line.tolist() + [False] * (len(shapes) - len(ground.corners))
     view.draw([canvas] * len(shapes), shapes, colours, is_line, 2)
     picture = np.ascontiguousarray(np.rot90(canvas, -1))
-    _write(picture, scenario)
+    _write(picture, scene)
     return picture
 
 
-def _colour(scenario: Scenario, row: int) -> Colour:
-    traffic = scenario.traffic
+def _colour(scene: Scene, row: int) -> Colour:
+    traffic = scene.traffic
     if row == EGO:
-        return CRASH_COLOUR if scenario.crashed else EGO_COLOUR
+        return CRASH_COLOUR if scene.crashed else EGO_COLOUR
     if traffic.kind[row] == Kind.VEHICLE:
         share = min(float(traffic.speed[row]) / FASTEST, 1.0)
         red, green, blue = np.rint(SLOW_COLOUR + share * (FAST_COLOUR - SLOW_COLOUR)).astype(int).tolist()
@@ -57,13 +57,13 @@ def _colour(scenario: Scenario, row: int) -> Colour:
     return PERSON_COLOUR if traffic.kind[row] == Kind.PERSON else STATIC_COLOUR
 
 
-def _write(picture: Image, scenario: Scenario) -> None:
-    episode, so_far = scenario.episode, scenario.episode.record(success=False)
+def _write(picture: Image, scene: Scene) -> None:
+    episode, so_far = scene.episode, scene.episode.record(success=False)
     parts = (
-        f"speed {scenario.traffic.speed[EGO]:4.1f} m/s",
+        f"speed {scene.traffic.speed[EGO]:4.1f} m/s",
         f"cost {episode.total_cost:.1f}",
         f"reward {episode.total_reward:.1f}",
-        f"route {100 * (1 - scenario.remaining):.0f} %",
+        f"route {100 * (1 - scene.remaining):.0f} %",
         f"driving score {100 * so_far['driving_score']:.0f} %",
         f"time to collision {so_far['min_ttc']:.1f} s",
         f"{episode.time:.1f} s",

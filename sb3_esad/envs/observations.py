@@ -7,40 +7,17 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from sb3_esad.envs.bev import BirdsEyeView, Ground
+from sb3_esad.envs.bev import BirdsEyeView
 from sb3_esad.envs.geometry import Floats, wrap_angle
 from sb3_esad.envs.lanes import LANE_WIDTH
-from sb3_esad.envs.lights import StopLines
 from sb3_esad.envs.road_users import EGO
-from sb3_esad.envs.roads import Road
-from sb3_esad.envs.routes import Route
+from sb3_esad.envs.scene import Scene
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.view import View
 
 SPEED_SCALE, DISTANCE_SCALE, WIDTH_SCALE = 30.0, 100.0, 16.0  # [m/s], [m], [m]
 EGO_FEATURES = ("speed", "heading_error", "lane_offset", "route_left", "room_left", "room_right")
 USER_FEATURES = ("presence", "ahead", "right", "speed_ahead", "speed_right", "cos", "sin")
-
-
-class Scene(Protocol):
-    """What an observation may look at."""
-
-    road: Road
-    route: Route
-    ground: Ground
-    traffic: Traffic
-
-    @property
-    def heading_error(self) -> float:
-        """Angle from the lane to the ego vehicle [rad]."""
-
-    @property
-    def stop_lines(self) -> StopLines:
-        """The lines before lights that are not green."""
-
-    @property
-    def remaining(self) -> float:
-        """Share of the route that lies ahead."""
 
 
 class Observation(Protocol):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from sb3_esad.envs.bev import Ground
 from sb3_esad.envs.config import COMMON, check_config, merge_config
+from sb3_esad.envs.drawing import Window, draw_scene
 from sb3_esad.envs.episode import Episode
 from sb3_esad.envs.geometry import bounded, wrap_angle
 from sb3_esad.envs.hazards import time_to_collision, users_hit
@@ -61,7 +62,7 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
         self.observation_space = self.observation.space
         self.action_space = spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.reward = DrivingReward(self.config)
-        self._window: Any = None
+        self._window: Window | None = None
 
     @classmethod
     def default_config(cls) -> dict[str, Any]:
@@ -245,8 +246,6 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
 
         :return: in mode ``"rgb_array"`` a picture, shape ``(rows, columns, 3)``; in mode ``"human"`` None, after showing it
         """
-        from sb3_esad.envs.drawing import Window, draw_scene
-
         if self.render_mode is None:
             return None
         picture = draw_scene(self)
