@@ -108,14 +108,24 @@ def evaluate_model(
     envs: list[Any] = dummy_env.envs
     vec_env = stack_frames(BaseAlgorithm._wrap_env(dummy_env, monitor_wrapper=False), model.observation_space)
     check_spaces(model, vec_env, env_id)
-    normalization = model.get_vec_normalize_env()
     observations, state, starts = vec_env.reset(), None, np.ones(n_envs, dtype=bool)
     while not all(env.finished for env in envs):
-        seen = normalization.normalize_obs(observations) if normalization else observations  # type: ignore[arg-type]
-        actions, state = model.predict(seen, state, starts, deterministic)  # type: ignore[arg-type]
+        actions, state = model.predict(normalised(model, observations), state, starts, deterministic)
         observations, _, starts, _ = vec_env.step(actions)
     vec_env.close()
     return [envs[index % n_envs].records[index // n_envs] for index in range(len(seeds))]
+
+
+def normalised(model: BaseAlgorithm, observations: Any) -> Any:
+    """
+    Show observations as a model knows them.
+
+    :param model: whose environment may be a ``VecNormalize``
+    :param observations: of an environment that is none
+    :return: the observations, normalised as in the model's training
+    """
+    normalization = model.get_vec_normalize_env()
+    return normalization.normalize_obs(observations) if normalization else observations
 
 
 def stack_frames(env: VecEnv, space: spaces.Space) -> VecEnv:

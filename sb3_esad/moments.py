@@ -114,7 +114,7 @@ def _speed(moment: Moment) -> Gauge:
 
 def _cost(moment: Moment, model: ESADLEND) -> Gauge:
     cost = float(moment.info.get(model.cost_key, 0.0))
-    return Gauge("cost of this step", f"{cost:.0f}   episode {moment.cost:.0f}", cost, None, BAD)
+    return Gauge("cost of this step", f"{round(cost, 2):g}   episode {round(moment.cost, 2):g}", cost, None, BAD)
 
 
 def _risk(model: ESADLEND, name: str, risk: float) -> Gauge:

@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_esad.common.costs import CostReader
 from sb3_esad.common.save_util import whole_file
 from sb3_esad.dream import DreamingDriver
-from sb3_esad.driving_evaluation import check_scenario, check_spaces
+from sb3_esad.driving_evaluation import check_scenario, check_spaces, normalised
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.envs.scenario import scenario_of
 from sb3_esad.esad_lend import ESADLEND
@@ -160,13 +160,13 @@ def _drive_model(
     observation, info = env.reset(seed=seed)
     verdict, cost, read_costs = "", 0.0, CostReader(driver.model.cost_key)
     while not verdict:
-        action = driver(observation)
+        action = driver(normalised(driver.model, observation))
         yield frame(Moment(env, observation, info, cost, verdict), driver)
         observation, _, terminated, truncated, info = env.step(action)
         cost += float(read_costs([info])[0])
         if terminated or truncated:
             verdict = _verdict(info, truncated)
-    driver(observation)
+    driver(normalised(driver.model, observation))
     yield from [frame(Moment(env, observation, info, cost, verdict), driver)] * LAST_FRAMES
 
 

@@ -16,9 +16,6 @@ from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.type_aliases import LatentState
 from sb3_esad.film import side_by_side, write_film
 
-OTHER_FORMATS = ("stdout", "log", "json", "csv")
-"""Outputs of SB3's logger that cannot show a histogram."""
-
 
 class WatchCallback(BaseCallback):
     """
@@ -66,8 +63,9 @@ class WatchCallback(BaseCallback):
 
     def _show_risks(self) -> None:
         if self._risks:
-            self.logger.record("safety/risk", th.cat(self._risks).cpu(), exclude=OTHER_FORMATS)
-            self._risks = []
+            risks, self._risks = th.cat(self._risks).cpu(), []
+            for output in self._outputs:  # what is recorded before the logger's next dump would replace it there
+                output.write({"safety/risk": risks}, {"safety/risk": ()}, self.num_timesteps)
 
     def _show_films(self, model: LatentAlgorithm) -> None:
         world_model = model.policy.average.world_model

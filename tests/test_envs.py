@@ -135,7 +135,8 @@ def test_traffic_does_not_crash_into_itself_and_merges() -> None:
         ({"policy_frequency": "5"}, "policy_frequency is '5'; choose"),
         ({"headway": (-1.0, -0.5)}, r"headway is \(-1\.0, -0\.5\); choose two numbers from 0 on, the smaller one first"),
         ({"desired_speed": (25.0, 21.5)}, r"desired_speed is \(25\.0, 21\.5\); choose two numbers"),
-        ({"lane_counts": 3}, "lane_counts is 3; choose a sequence of whole numbers from 1 on"),
+        ({"lane_counts": 3}, "lane_counts is 3; choose a sequence of whole numbers from 2 on"),
+        ({"lane_counts": (1, 2)}, r"lane_counts is \(1, 2\); choose a sequence of whole numbers from 2 on"),
         ({"lane_counts": ()}, r"lane_counts is \(\); choose"),
         ({"slow_share": 1.2}, r"slow_share is 1\.2; choose a share from 0 to 1"),
         ({"merging_cars": -1}, "merging_cars is -1; choose a whole number from 0 on"),
@@ -307,8 +308,9 @@ def test_wrong_way_and_ramp() -> None:
     assert info["rewards"]["velocity"] == info["rewards"]["lane"] == info["rewards"]["orientation"] == 0.0
     assert reward == 0.0
     env = alone(speed=20.0, x=float(env.road.start[env.lanes, 0]) + 20.0, y=LANE_WIDTH * env.lanes)
-    env.step(HOLD)
+    _, reward, _, _, _ = env.step(HOLD)
     assert env.episode.off_route == pytest.approx(4.0)
+    assert reward == 0.0, "the ramp is not the way"
 
 
 def test_graded_cost_rises_before_the_crash() -> None:

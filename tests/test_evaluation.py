@@ -259,6 +259,21 @@ def test_record_model(policy: str, tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["episode.mp4"]
 
 
+def test_a_film_shows_the_model_what_it_was_trained_on(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    env_id = ENV_IDS["MultiInputPolicy"]
+    env = VecNormalize(DummyVecEnv([lambda: gym.make(env_id)]), norm_obs_keys=["vector"])
+    env.obs_rms["vector"].mean += 0.5  # type: ignore[index]
+    model, seen = ESADLEND("MultiInputPolicy", env, policy_kwargs=TINY, buffer_size=100), []
+    predict = model.predict
+    monkeypatch.setattr(model, "predict", lambda observation, *args, **kwargs: (
+        seen.append(observation["vector"].ravel()) or predict(observation, *args, **kwargs)))  # fmt: skip
+    evaluate_model(model, env_id, [3])
+    n_steps = len(seen)
+    record_model(tmp_path / "episode.mp4", model, env_id, seed=3)
+    np.testing.assert_array_equal(seen[n_steps], seen[0])
+    assert seen[0].max() < 0.9, "the presence of others is 1"
+
+
 def test_what_is_explained_is_what_is_done(model: ESADLEND) -> None:
     env = gym.make("short-image-v0")
     driver, memory = ExplainedDriver(model, n_futures=5, horizon=3), None

@@ -139,6 +139,8 @@ def test_worst_mean_by_hand() -> None:
         ((65.0, 6.5), 0.0, 15.0, math.inf),  # half a metre of room beside it
         ((65.0, 5.5), 0.0, 15.0, 1.0),  # half a metre of overlap
         ((65.0, 4.0), math.pi, 15.0, 10.0 / 40.0),  # oncoming
+        ((65.0, 7.0), math.pi / 2, 0.0, 11.5 / 25.0),  # stands across the lanes, its rear half a metre in the path
+        ((65.0, 7.6), math.pi / 2, 0.0, math.inf),  # its rear beside it
     ],
 )
 def test_time_to_collision_by_hand(place: tuple[float, float], heading: float, speed: float, expected: float) -> None:

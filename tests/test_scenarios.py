@@ -235,6 +235,44 @@ def test_obstacles_appear_suddenly_ahead_and_leave_a_way_out() -> None:
     assert seen >= 15
 
 
+def place(env: Any, lane: int, along: float, across: float) -> None:
+    """Put the ego vehicle beside the centre of a lane, in the direction of the lane."""
+    env.traffic.position[EGO] = env.road.position(lane, along, across)
+    env.traffic.heading[EGO] = env.road.lanes[lane].heading_at(along)
+    env.traffic.move(0.0)
+
+
+@pytest.mark.parametrize(
+    ("name", "nobody"),
+    [
+        ("town06", {"cars": 0}),
+        ("town07", {"cars": 0}),
+        ("traffic-negotiation", {"cars_per_street": 0}),
+    ],
+)
+@pytest.mark.parametrize(("across", "wrong"), [(0.0, False), (-1.5, False), (-4.0, True)])
+def test_the_lane_of_those_who_come_towards_one_is_the_wrong_way(
+    name: str, nobody: dict[str, int], across: float, wrong: bool
+) -> None:
+    env = make(f"esad-{name}-v0", config=nobody)
+    env.reset(seed=3)
+    leftmost = env.road.row(int(env.traffic.lane[EGO]), env.road.left)[-1]
+    place(env, leftmost, float(env.traffic.along[leftmost, EGO]), across)
+    _, reward, _, _, info = env.step(np.zeros(2))
+    assert info["cost_terms"]["wrong_way"] == bool(info["cost"]) == (reward == 0.0) == wrong
+    assert (env.episode.off_route > 0) == wrong
+
+
+def test_a_street_that_is_not_on_the_route_pays_nothing() -> None:
+    env = make("esad-traffic-negotiation-v0", config={"cars_per_street": 0})
+    for seed in range(3):
+        env.reset(seed=seed)
+        way_out = next(w.target for w in env.crossroads.ways if not env.route.contains[w.target])
+        place(env, way_out, 20.0, 0.0)
+        _, reward, _, _, info = env.step(np.zeros(2))
+        assert reward == info["cost"] == 0.0 and info["speed"] > 0
+
+
 def test_ways_through_a_junction_cross_or_not() -> None:
     road, _, ways, crossings = crossroads()
     crosses = crossings.crosses

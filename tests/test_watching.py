@@ -176,7 +176,7 @@ def test_a_watched_training_is_the_same() -> None:
 def test_the_histogram_has_every_step_of_the_policy_once(n_envs: int) -> None:
     model = make_latent(VECTOR, n_envs)
     output, risks = watched(model), Risks()
-    model.learn(80, callback=[WatchCallback(every=20), risks], log_interval=1)
+    model.learn(80, callback=[WatchCallback(every=2), risks], log_interval=1)
     assert not output.films
     assert {key for key, _, _ in output.histograms} == {"safety/risk"}
     shown = th.cat([each for _, each, _ in output.histograms])

@@ -112,8 +112,8 @@ RULES = (
     ),
     Rule(
         ("lane_counts",),
-        lambda value: np.ndim(value) == 1 and len(value) > 0 and all(_is_whole(lanes, 1) for lanes in value),
-        "a sequence of whole numbers from 1 on",
+        lambda value: np.ndim(value) == 1 and len(value) > 0 and all(_is_whole(lanes, 2) for lanes in value),
+        "a sequence of whole numbers from 2 on",
     ),
     Rule(
         ("obstacles",),

@@ -66,16 +66,18 @@ def time_to_collision(traffic: Traffic | Bodies) -> float:
     """
     Smallest distance over closing speed to any user in the ego vehicle's path, if both kept their velocities.
 
-    The path is as wide as the ego vehicle and follows its heading; a user is in it if its own width overlaps it.
+    The path is as wide as the ego vehicle and follows its heading; a user is as wide and as long as it is from there.
 
     :param traffic: all road users
     :return: infinite if nothing in the path is being approached [s]
     """
     ahead, across = in_frame((traffic.position - traffic.position[EGO]).T, traffic.direction[EGO])
     closing = traffic.speed[EGO] - traffic.velocity @ traffic.direction[EGO]
-    beside = (traffic.size[:, 1] + traffic.size[EGO, 1]) / 2
+    length, width = traffic.size.T
+    cos, sin = np.abs(in_frame(traffic.direction.T, traffic.direction[EGO]))
+    beside = (length * sin + width * cos + width[EGO]) / 2
     rows = ((np.abs(across) < beside) & (ahead > 0) & (closing > 0)).nonzero()[0]
     if not rows.size:
         return np.inf
-    gap = ahead[rows] - (traffic.size[rows, 0] + traffic.size[EGO, 0]) / 2
+    gap = ahead[rows] - ((length * cos + width * sin)[rows] + length[EGO]) / 2
     return float((np.maximum(gap, 0.0) / closing[rows]).min())

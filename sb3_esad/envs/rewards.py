@@ -51,7 +51,7 @@ def exploration_reward(visits: int, decay: float) -> float:
     """
     R_e = exp(-nu n).
 
-    :param visits: how often n the region was entered before
+    :param visits: steps n that were made in the region before
     :param decay: nu
     :return: within (0, 1]
     """

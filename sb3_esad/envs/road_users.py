@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from sb3_esad.envs.geometry import Floats, directions, outlines, placed
+from sb3_esad.envs.geometry import Floats, directions, outlines, placed, wrap_angle
 from sb3_esad.envs.lanes import CAR_LENGTH, LANE_WIDTH
 from sb3_esad.envs.paths import Outlook, Paths
 from sb3_esad.envs.roads import Bools, Ints, Road
@@ -61,7 +61,7 @@ class RoadUsers:
         aside, overshoot = np.abs(across), road.overshoot(along)
         self.along, self.across = along[:, :count], across[:, :count]
         self.present = (aside[:, :count] <= self._berth) & (overshoot[:, :count] <= CAR_LENGTH)
-        self.off_road = not all(road.covers(aside[:, -4:], overshoot[:, -4:]))
+        self.off_road = not road.covers(aside[:, -4:], overshoot[:, -4:]).any(0).all()
         heading, distance = self.heading[self._now_and_soon], aside + overshoot
         lane = road.closest_lane(along[:, :-4], distance[:, :-4], heading, self._handicap)
         self.lane, self.target_lane[self.outsiders] = lane[:count], lane[count:]
@@ -98,6 +98,17 @@ class RoadUsers:
         themselves = np.arange(len(place)), outlook.rows
         there[themselves] = False
         return place - place[themselves][:, None], there
+
+    def ego_on_lanes(self) -> tuple[Floats, Bools]:
+        """
+        Compare the ego vehicle with every lane.
+
+        :return: the angle from the lane to it, within [-pi, pi) [rad], and whether its centre lies on the lane, each
+            ``(lanes,)``
+        """
+        along, across = self.along[:, [EGO]], self.across[:, [EGO]]
+        turns = wrap_angle(self.heading[EGO] - (self.road.heading + self.road.curvature * along[:, 0]))
+        return turns, self.road.covers(np.abs(across), self.road.overshoot(along))[:, 0]
 
     def neighbours(self, rows: Ints, lanes: Ints) -> tuple[Ints, Ints]:
         """

@@ -200,13 +200,13 @@ class Road:
 
     def covers(self, aside: Floats, overshoot: Floats) -> Bools:
         """
-        Whether points lie on any lane's surface.
+        Whether points lie on the surfaces of lanes.
 
         :param aside: distance from the centre of each lane, shape ``(lanes, n)`` [m]
         :param overshoot: from :meth:`overshoot`, shape ``(lanes, n)`` [m]
-        :return: truth values, shape ``(n,)``
+        :return: truth values, shape ``(lanes, n)``
         """
-        return np.asarray(((aside <= self._half_width) & (overshoot == 0)).any(0))
+        return np.asarray((aside <= self._half_width) & (overshoot == 0))
 
     def room(self, lane: int, across: Floats) -> tuple[float, float]:
         """

@@ -13,7 +13,7 @@ from sb3_esad.envs.bev import Ground
 from sb3_esad.envs.config import COMMON, check_config, merge_config
 from sb3_esad.envs.drawing import Window, draw_scene
 from sb3_esad.envs.episode import Episode
-from sb3_esad.envs.geometry import bounded, wrap_angle
+from sb3_esad.envs.geometry import bounded
 from sb3_esad.envs.hazards import time_to_collision, users_hit
 from sb3_esad.envs.lights import NO_LINES, StopLines
 from sb3_esad.envs.observations import OBSERVATIONS, Observation
@@ -24,6 +24,8 @@ from sb3_esad.envs.routes import Route
 from sb3_esad.envs.traffic import Traffic
 from sb3_esad.envs.users import Kind
 from sb3_esad.envs.vehicle import Controls
+
+ONCOMING = 3 * math.pi / 4  # a lane that is turned further than this from the ego vehicle is one of oncoming traffic [rad]
 
 
 class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
@@ -202,15 +204,17 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
             if self.crashed:
                 break
         self._note_heading()
-        on_route = bool(self.route.contains[traffic.lane[EGO]]) and not self.wrong_way
-        self.episode.add_motion(duration, metres, self._progress(), on_route)
+        self.episode.add_motion(duration, metres, self._progress(), self.on_route)
 
     def _note_heading(self) -> None:
-        """Note the angle from the lane to the ego vehicle, within [-pi, pi) [rad], and whether that is the wrong direction."""
-        traffic, lane = self.traffic, int(self.traffic.lane[EGO])
-        along_lane = self.road.lanes[lane].heading_at(float(traffic.along[lane, EGO]))
-        self.heading_error = float(wrap_angle(float(traffic.heading[EGO]) - along_lane))
-        self.wrong_way = abs(self.heading_error) > math.pi / 2
+        """Note the angle from the lane to the ego vehicle [rad], whether it drives against the traffic, or on its route."""
+        lane = int(self.traffic.lane[EGO])
+        turns, is_there = self.traffic.ego_on_lanes()
+        self.heading_error = float(turns[lane])
+        # Its lane is one of its direction if there is one nearby, also where it drives on one of oncoming traffic
+        on_oncoming = bool(is_there.any() and np.abs(turns[is_there]).min() > ONCOMING)
+        self.wrong_way = on_oncoming or abs(self.heading_error) > math.pi / 2
+        self.on_route = bool(self.route.contains[lane]) and not self.wrong_way
 
     def _check_crash(self) -> None:
         hit = users_hit(self.traffic)
@@ -237,7 +241,8 @@ class Scenario(gymnasium.Env[Any, NDArray[np.float32]]):
 
     def _reward_terms(self) -> dict[str, float]:
         traffic, lane = self.traffic, int(self.traffic.lane[EGO])
-        speed, offset = float(traffic.speed[EGO]), float(traffic.across[lane, EGO])
+        speed = float(traffic.speed[EGO]) if self.on_route else 0.0  # what leads elsewhere is no way along the route
+        offset = float(traffic.across[lane, EGO])
         return self.reward.terms(speed, self.heading_error, lane, offset, self._progress())
 
     def render(self) -> NDArray[np.uint8] | None:
