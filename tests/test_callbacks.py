@@ -15,7 +15,7 @@ from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-from sb3_esad import ESADLEND
+from sb3_esad import ADEND, ESADLEND
 from sb3_esad.common import callbacks as callbacks_module
 from sb3_esad.common.callbacks import CostEvalCallback, LagrangeCallback, prepend
 from sb3_esad.common.costs import CostReader
@@ -267,7 +267,7 @@ def test_best_model_is_feasible_first(monkeypatch: pytest.MonkeyPatch, tmp_path:
 def test_without_limit_the_highest_reward_wins(monkeypatch: pytest.MonkeyPatch) -> None:
     evaluate_like(monkeypatch, [(1.0, 5.0), (2.0, 9.0)])
     callback = CostEvalCallback(DummyVecEnv([CountingEnv]), eval_freq=5, verbose=0)
-    make_model().learn(10, callback=callback)
+    SAC("MlpPolicy", CountingEnv(), device="cpu").learn(10, callback=callback)
     assert callback.best_mean_reward == 2.0 and isinstance(callback, EvalCallback)
 
 
@@ -284,9 +284,16 @@ def test_cost_of_the_model_is_the_default() -> None:
     assert evaluate_policy(model, Monitor(Crashing(episode_length=5)), 2)[2] == 5.0
 
 
+def test_a_model_that_keeps_no_limit_is_always_feasible(monkeypatch: pytest.MonkeyPatch) -> None:
+    evaluate_like(monkeypatch, [(1.0, 0.0), (2.0, 9.0)])
+    callback = CostEvalCallback(DummyVecEnv([CountingEnv]), eval_freq=5, verbose=0)
+    ADEND("MlpPolicy", CountingEnv(), **TINY).learn(10, callback=callback)
+    assert callback.cost_limit is None and callback.best_mean_reward == 2.0
+
+
 def test_limit_of_the_model_is_the_default(monkeypatch: pytest.MonkeyPatch) -> None:
     evaluate_like(monkeypatch, [(1.0, 0.0), (2.0, 9.0)])
-    model = make_model()
+    model = SAC("MlpPolicy", CountingEnv(), device="cpu")
     model.cost_limit = 0.0  # type: ignore[attr-defined]
     callback = CostEvalCallback(DummyVecEnv([CountingEnv]), eval_freq=5, verbose=0)
     model.learn(10, callback=callback)

@@ -12,14 +12,20 @@ import numpy as np
 import pytest
 from kills import Training, endure, steps_of
 from stable_baselines3 import SAC
-from stable_baselines3.common.callbacks import BaseCallback, EvalCallback
+from stable_baselines3.common.callbacks import (
+    BaseCallback,
+    EvalCallback,
+    EveryNTimesteps,
+    StopTrainingOnMaxEpisodes,
+    StopTrainingOnNoModelImprovement,
+)
 from stable_baselines3.common.monitor import Monitor
 from stable_baselines3.common.noise import OrnsteinUhlenbeckActionNoise
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack, VecNormalize
 
 from sb3_esad import ADEND, ESADLEND, SADLEN, WCSAC, SACLag
 from sb3_esad.common.callbacks import CostEvalCallback
-from sb3_esad.common.checkpoints import CHECKPOINT, RunCheckpointCallback
+from sb3_esad.common.checkpoints import CHECKPOINT, MEMORY, RunCheckpointCallback
 from sb3_esad.common.cost_aware_algorithm import CostAwareAlgorithm
 from sb3_esad.common.schedules import HoldThenFall
 from tests.conftest import PICTURE, TINY, VECTOR, CountingEnv, RandomEnv, assert_same
@@ -105,6 +111,33 @@ def test_a_resumed_run_is_the_one_that_was_never_cut_off(
     assert_same(facts(model, evaluating[0]), facts(other, evaluating[1]))
     assert steps_of(kept) == steps_of(whole), "checkpoints go on, too"
     assert len(list(kept.iterdir())) == 1
+
+
+def test_evaluations_that_are_called_by_events_go_on_as_well(tmp_path: Path) -> None:
+    whole, kept = tmp_path / "whole", tmp_path / "kept"
+    settings = {"eval_freq": 1, "n_eval_episodes": 2, "deterministic": False, "verbose": 0, "warn": False}
+    evaluating = [CostEvalCallback(one(), log_path=str(tmp_path / name), **settings) for name in ("first", "second")]
+    model = WCSAC("MlpPolicy", one(), **MODEL_FREE)
+    model.learn(TOTAL, [RunCheckpointCallback(INTERVAL, whole), EveryNTimesteps(15, evaluating[0]), Cut(whole, kept)])
+    other = WCSAC.resume(kept, one(), device="cpu")
+    other.learn(TOTAL, [EveryNTimesteps(15, evaluating[1]), RunCheckpointCallback(INTERVAL, kept)])
+    assert evaluating[0].evaluations_timesteps == [15, 30, 45]
+    assert_same(facts(model, evaluating[0]), facts(other, evaluating[1]))
+
+
+def test_who_stops_a_training_goes_on_counting(tmp_path: Path) -> None:
+    whole, kept = tmp_path / "whole", tmp_path / "kept"
+    model = WCSAC("MlpPolicy", one(), **IDLE)
+    model.learn(500, [RunCheckpointCallback(INTERVAL, whole), StopTrainingOnMaxEpisodes(10), Cut(whole, kept)])
+    other = WCSAC.resume(kept, one(), device="cpu")
+    other.learn(500, [RunCheckpointCallback(INTERVAL, kept), StopTrainingOnMaxEpisodes(10)])
+    assert CUT < model.num_timesteps == other.num_timesteps < 500
+
+
+def test_names_of_what_callbacks_remember_are_those_of_sb3() -> None:
+    stops = StopTrainingOnMaxEpisodes(1), StopTrainingOnNoModelImprovement(1), EveryNTimesteps(1, Remembers())
+    known = {name for each in (*stops, CostEvalCallback(one())) for name in vars(each)}
+    assert set(MEMORY) <= known
 
 
 def test_pictures_and_a_buffer_that_is_full(tmp_path: Path) -> None:

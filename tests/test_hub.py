@@ -18,7 +18,7 @@ import yaml
 from huggingface_hub import ModelCard, constants
 from test_zoo import ENV, settings, train
 
-from sb3_esad import ESADLEND
+from sb3_esad import ADEND, ESADLEND
 from sb3_esad.__main__ import main
 from sb3_esad.algorithms import ALGORITHMS
 from sb3_esad.report import summarise_any
@@ -159,6 +159,13 @@ def test_the_card_claims_no_more_than_the_episodes_show(limit: float | None, cos
     assert "env_kwargs:\n  g: 9.8" in card
 
 
+def test_the_card_knows_that_ad_end_keeps_no_limit() -> None:
+    model = ADEND("MlpPolicy", "Pendulum-v1", buffer_size=100)
+    agent = Agent("ad_end", EnvironmentName("Pendulum-v1"), Path("a.zip"), Path(), {}, {})
+    figures = summarise_any([{"return": 1.0, "cost": 1.0, "steps": 5.0}])
+    assert "without any limit." in model_card(agent, model, figures, range(1), "me/mine")
+
+
 def test_stacked_frames_are_shared(hub: LocalHub, tmp_path: Path) -> None:
     agent = ["--algo", "wcsac", "--env", IMAGES, "-f", str(tmp_path)]
     small = settings(policy="CnnPolicy", policy_kwargs={"net_arch": [8]}, frame_stack=2, buffer_size=100)
@@ -231,7 +238,8 @@ def of_zip(**members: bytes) -> bytes:
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
-        ("config.yml", b"env_wrapper: {os.system: {}}", "config.yml has env_wrapper; only arguments of ESADLEND and"),
+        ("config.yml", b"env_wrapper: {os.system: {}}", "config.yml has env_wrapper; only plain arguments of ESADLEND and"),
+        ("config.yml", b"policy_kwargs: __import__('os').getcwd()", "config.yml has policy_kwargs; only plain arguments"),
         ("config.yml", b"normalize: print(1)", "config.yml has normalize; only"),
         ("config.yml", b"a: !!python/object/apply:os.getcwd []", "config.yml holds more than plain values"),
         ("env_kwargs.yml", b"!!python/object/apply:os.getcwd []", "env_kwargs.yml holds more than plain values"),
@@ -274,7 +282,7 @@ def test_curves_stay_in_their_folder(pushed: dict[str, bytes], tmp_path: Path) -
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda config: {**config, "normalize": True}, "config.yml has normalize, normalize_kwargs; only arguments"),
+        (lambda config: {**config, "normalize": True}, "config.yml has normalize, normalize_kwargs; only plain"),
         (lambda config: {**config, "callback": "a.B"}, "config.yml has callback; only"),
         (
             lambda config: {**config, "policy_kwargs": {"activation_fn": complex}},

@@ -54,6 +54,16 @@ def test_an_outlier_does_not_blind() -> None:
     assert scale.variance.item() == pytest.approx(1.0, abs=0.1)
 
 
+@pytest.mark.parametrize("share", [0.002, 0.005, 0.01, 0.02])
+def test_an_entry_that_varies_seldom_keeps_its_scale(share: float) -> None:
+    scale = RunningScale(1)
+    scale.follow(th.zeros(256, 1))
+    for _ in range(3000):
+        scale.follow((th.rand(256, 1) < share) * (0.2 + 0.8 * th.rand(256, 1)))
+    true = (share * (0.6**2 + 0.8**2 / 12) - (0.6 * share) ** 2) ** 0.5
+    assert true / 1.5 < scale.variance.item() ** 0.5 < 1.5 * true
+
+
 def test_tables_keep_their_shape() -> None:
     preprocessing = Preprocessing(spaces.Box(-1, 1, (2, 3), np.float32), normalize_images=True)
     seen = th.rand(5, 2, 3)

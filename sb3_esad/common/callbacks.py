@@ -11,6 +11,7 @@ from stable_baselines3.common.vec_env import VecEnv, sync_envs_normalization
 
 from sb3_esad.common.evaluation import evaluate_policy
 from sb3_esad.common.log_keys import key_of
+from sb3_esad.common.penalties import kept_limit
 from sb3_esad.common.save_util import whole_file
 
 
@@ -83,7 +84,7 @@ class CostEvalCallback(EvalCallback):
     like ``results``. It and ``best_model.zip`` are replaced at once, never half-written.
 
     :param eval_env: environment to evaluate in
-    :param cost_limit: undiscounted cost allowed per episode; None takes the ``cost_limit`` of the model, if it has one,
+    :param cost_limit: undiscounted cost allowed per episode; None takes the limit that the model keeps, if it keeps one,
         and a model without a limit is always feasible
     :param cost_key: key of the cost in the info dict; None for that of the model, or "cost" if it has none
     :param kwargs: see SB3's ``EvalCallback``
@@ -103,7 +104,7 @@ class CostEvalCallback(EvalCallback):
     def _init_callback(self) -> None:
         super()._init_callback()
         if self.cost_limit is None:
-            self.cost_limit = getattr(self.model, "cost_limit", None)
+            self.cost_limit = kept_limit(self.model)
 
     def _on_step(self) -> bool:
         if self.eval_freq <= 0 or self.n_calls % self.eval_freq != 0:

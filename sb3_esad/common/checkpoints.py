@@ -24,7 +24,8 @@ from sb3_esad.common.save_util import whole_file
 CHECKPOINT = "checkpoint.zip"
 """Name of the newest checkpoint in the folder of a run."""
 MODEL, BUFFER, STATISTICS, PROGRESS = "model.zip", "replay_buffer.pkl", "vecnormalize.pkl", "progress.json"
-MEMORY = ("last_time_triggered", "best_mean_reward", "last_mean_reward", *EVALUATIONS)
+COUNTED = ("last_time_trigger", "n_episodes", "no_improvement_evals")
+MEMORY = (*COUNTED, "last_best_mean_reward", "best_mean_reward", "last_mean_reward", *EVALUATIONS)
 """What SB3's own callbacks remember, by the names of the attributes."""
 PATIENCE = 0.25
 """Share of the interval, its last, in which a checkpoint waits for the end of an episode."""
@@ -163,7 +164,7 @@ def _describe(callback: BaseCallback) -> tuple[str, int, dict[str, Any]]:
 
 
 def _seed_evaluations(callback: BaseCallback, progress: Progress) -> None:
-    for each in all_callbacks(callback):
+    for each in _all_with_events(callback):
         if isinstance(each, EvalCallback):
             each.eval_env.seed(progress.seed + progress.n_envs)
 

@@ -47,6 +47,7 @@ class AugmentedLagrangian(Penalty):
     :raises ValueError: if an argument is out of its range
     """
 
+    cost_limit: float
     multiplier: th.Tensor
     mean_violation: th.Tensor
     n_updates: th.Tensor

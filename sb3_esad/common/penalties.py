@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import torch as th
+from stable_baselines3.common.base_class import BaseAlgorithm
 from torch import nn
 
 from sb3_esad.common.type_aliases import Logs
@@ -13,6 +14,9 @@ from sb3_esad.common.type_aliases import Logs
 
 class Penalty(nn.Module, ABC):
     """How a cost limit enters the actor's loss and the choice of actions."""
+
+    cost_limit: float | None
+    """Undiscounted cost allowed per episode; None is no limit."""
 
     def load_state_dict(self, state_dict: Mapping[str, Any], strict: bool = True, assign: bool = False) -> Any:
         """
@@ -116,6 +120,17 @@ class Penalty(nn.Module, ABC):
         """
 
 
+def kept_limit(model: BaseAlgorithm) -> float | None:
+    """
+    Tell what limit a model keeps, if it is one of ours; what it was given may be of no effect.
+
+    :param model: of any algorithm
+    :return: undiscounted cost allowed per episode, None for no limit
+    """
+    limit: float | None = getattr(getattr(model, "penalty", model), "cost_limit", None)
+    return limit
+
+
 class NoPenalty(Penalty):
     """
     The absence of a limit: nothing is penalised, everything is admissible.
@@ -123,6 +138,7 @@ class NoPenalty(Penalty):
     :param settings: those of :class:`AugmentedLagrangian`, so that either can be built by the same call; ignored
     """
 
+    cost_limit = None
     budget = 0.0
     budget_scale = 1.0
 

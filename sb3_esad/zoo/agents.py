@@ -18,6 +18,8 @@ from sb3_esad.algorithms import ALGORITHMS
 from sb3_esad.hyperparams import RUN_KEYS, constructor_arguments
 
 CONFIG, ARGUMENTS, ENV_KWARGS, CURVES = "config.yml", "args.yml", "env_kwargs.yml", "train_eval_metrics.zip"
+EXPRESSIONS = ("policy_kwargs", "replay_buffer_class", "replay_buffer_kwargs")
+"""Settings that RL Zoo takes for Python where they are words."""
 LARGEST_CURVE = 2**26
 """Bytes of a learning curve at most."""
 
@@ -77,9 +79,10 @@ def check_settings(settings: Mapping[str, Any], algo: str, source: object) -> No
     """
     algorithm = ALGORITHMS[algo]
     shared = {*constructor_arguments(algorithm), *RUN_KEYS}
-    foreign = [str(key) for key in settings if key not in shared]
+    named = {key for key in EXPRESSIONS if isinstance(settings.get(key), str)}
+    foreign = [str(key) for key in settings if key not in shared or key in named]
     if foreign:
-        what = f"only arguments of {algorithm.__name__} and {', '.join(RUN_KEYS)} are shared"
+        what = f"only plain arguments of {algorithm.__name__} and {', '.join(RUN_KEYS)} are shared"
         raise ValueError(f"{source} has {', '.join(foreign)}; {what}, for others may name code to run.")
 
 

@@ -8,6 +8,7 @@ import yaml
 from huggingface_hub import EvalResult, ModelCardData
 from stable_baselines3.common.base_class import BaseAlgorithm
 
+from sb3_esad.common.penalties import kept_limit
 from sb3_esad.envs.intervals import poisson_interval
 from sb3_esad.report import Figures, format_table
 from sb3_esad.zoo.agents import Agent
@@ -73,7 +74,7 @@ def _limit(model: Any, figures: Figures) -> str:
     Student's interval has no width where no episode cost anything, and Poisson's too little where costs come in swarms: the
     wider counts.
     """
-    limit, episodes, cost = getattr(model, "cost_limit", None), figures["episodes"], figures["cost"]
+    limit, episodes, cost = kept_limit(model), figures["episodes"], figures["cost"]
     least, most = poisson_interval(cost * episodes)
     low, high = min(figures["cost_low"], least / episodes), max(figures["cost_high"], most / episodes)
     spent = f"An episode cost {cost:.3f} [{low:.3f}, {high:.3f}]"
