@@ -73,6 +73,11 @@ def test_discounted_budget(limit: float, gamma: float, length: float, expected: 
     assert F.discounted_budget(limit, gamma, length) == pytest.approx(expected, abs=1e-4)
 
 
+def test_where_only_time_ends_episodes_the_budget_is_that_of_a_steady_rate() -> None:
+    rates = [F.discounted_budget(1.0, 0.97, 20, timeouts) for timeouts in (0.0, 0.5, 1.0)]
+    assert rates == pytest.approx([(1 - 0.97**20) / 0.6, (1 - 0.97**20 / 2) / 0.6, 1 / 0.6])
+
+
 def test_discounted_budget_is_continuous_at_one() -> None:
     assert F.discounted_budget(2.0, 1.0 - 1e-7, 50) == pytest.approx(2.0, abs=1e-4)
 

@@ -166,8 +166,21 @@ def test_every_episode_has_a_cost_and_the_limit_allows_it() -> None:
     penalty = make_penalty(cost_limit=1.0, cost_gamma=0.97, episode_length=1000, road_steps=200)
     observe_in_step(penalty, [0.0] * 10 + [0.5] + [0.0] * 9, n_envs=2, n_episodes=100)
     assert penalty.episodes.expected_cost == pytest.approx(0.5, rel=0.05)
-    assert penalty.budget == pytest.approx(discounted_budget(1.0, 0.97, 20))
+    assert penalty.budget == pytest.approx(discounted_budget(1.0, 0.97, 20, timeouts=1.0))
     assert penalty.multiplier.item() == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize(("gamma", "length"), [(0.97, 20), (0.99, 20), (0.9, 20)])
+def test_critics_that_look_beyond_a_time_limit_are_right(gamma: float, length: int) -> None:
+    """Every step costs 1 by the chance that is allowed, whatever is done: critics must say p / (1 - gamma)."""
+    penalty, random = make_penalty(cost_limit=1.0, risk_level=1.0, cost_gamma=gamma), np.random.default_rng(0)
+    hazard = 1.0 / length
+    for step in range(1, 6001):
+        penalty.note_prediction(th.full((4,), hazard / (1 - gamma)))
+        last = np.full(4, step % length == 0)
+        penalty.observe((random.random(4) < hazard).astype(float), last, truncated=last)
+    assert penalty.budget == pytest.approx(hazard / (1 - gamma), rel=1e-5)
+    assert penalty.calibration == pytest.approx(1.0, abs=0.15)
 
 
 def test_long_episodes_with_a_cost_are_not_taken_for_short_ones() -> None:

@@ -25,6 +25,7 @@ class EpisodeRecord(nn.Module):
     n_episodes: th.Tensor
     n_ended: th.Tensor
     mean_length: th.Tensor
+    timeouts: th.Tensor
 
     def __init__(self, cost_gamma: float, episode_length: float, window: int, road_steps: int = 2000) -> None:
         super().__init__()
@@ -36,6 +37,7 @@ class EpisodeRecord(nn.Module):
         self.register_buffer("n_episodes", th.zeros(()))
         self.register_buffer("n_ended", th.zeros(()))
         self.register_buffer("mean_length", th.tensor(float(episode_length)))
+        self.register_buffer("timeouts", th.zeros(()))
         self.forget_unfinished()
 
     def forget_unfinished(self) -> None:
@@ -68,14 +70,14 @@ class EpisodeRecord(nn.Module):
             self._whole = np.ones(len(costs), dtype=bool)
         # Environments in step with each other would else show many steps of the same part of an episode
         self.recent.length.fill_(max(self.road_steps, math.ceil(2 * self._steps_of_episodes)))
+        timed_out = np.zeros(len(costs), dtype=bool) if truncated is None else np.asarray(truncated, dtype=bool)
         # A cost counts in the discounted cost to come of every earlier step of its episode: 1 + gamma + gamma^2 + ...
         self._weights = 1.0 + self.cost_gamma * self._weights
         self.recent.add(len(costs), costs=costs.sum(), costs_to_come=(self._weights * costs).sum())
-        self._weights[np.asarray(dones, dtype=bool)] = 0.0
-        ended_by_cost = (costs > 0) if truncated is None else (costs > 0) & ~np.asarray(truncated, dtype=bool)
+        self._weights[np.asarray(dones, dtype=bool) & ~timed_out] = 0.0  # critics look beyond a time limit as well
         for episode in self._under_way.add(costs, dones):
             if self._whole[episode.env]:
-                self._remember(episode, bool(ended_by_cost[episode.env]))
+                self._remember(episode, bool(costs[episode.env] > 0), bool(timed_out[episode.env]))
             self._whole[episode.env] = True
 
     def pass_over(self, dones: np.ndarray) -> None:
@@ -86,12 +88,14 @@ class EpisodeRecord(nn.Module):
         """
         self._whole = np.array(dones, dtype=bool)
 
-    def _remember(self, episode: FinishedEpisode, ended_by_cost: bool) -> None:
+    def _remember(self, episode: FinishedEpisode, costs: bool, timed_out: bool) -> None:
         self.costs[int(self.n_episodes) % self.window] = episode.cost
         self.n_episodes += 1
-        if not ended_by_cost:
+        if timed_out or not costs:
             self.n_ended += 1
-            self.mean_length += (episode.length - self.mean_length) / self.n_ended.clamp(max=self.window)
+            counted = self.n_ended.clamp(max=self.window)
+            self.mean_length += (episode.length - self.mean_length) / counted
+            self.timeouts += (float(timed_out) - self.timeouts) / counted
 
     @th.no_grad()
     def note_prediction(self, values: th.Tensor) -> None:

@@ -90,20 +90,22 @@ def wasserstein2(mean1: th.Tensor, variance1: th.Tensor, mean2: th.Tensor, varia
     return (mean1 - mean2) ** 2 + (variance1.sqrt() - variance2.sqrt()) ** 2
 
 
-def discounted_budget(cost_limit: float, gamma: float, episode_length: float) -> float:
+def discounted_budget(cost_limit: float, gamma: float, episode_length: float, timeouts: float = 0.0) -> float:
     """
     The discounted value of a cost limit that is spread evenly over an episode.
 
-    d = D (1 - gamma^T) / ((1 - gamma) T) (WCSAC).
+    d = D (1 - gamma^T) / ((1 - gamma) T) (WCSAC). Where only time ends episodes critics look beyond their ends, as if they
+    went on at the same rate, so that there d = D / ((1 - gamma) T).
 
     :param cost_limit: D, the undiscounted cost allowed per episode
     :param gamma: discount of the cost, in [0, 1]; 1 returns ``cost_limit``
     :param episode_length: T > 0, in steps
+    :param timeouts: share of episodes that only time ends
     :return: d, comparable with a discounted cost value
     """
     if gamma == 1.0:
         return cost_limit
-    return cost_limit * (1.0 - gamma**episode_length) / ((1.0 - gamma) * episode_length)
+    return cost_limit * (1.0 - (1.0 - timeouts) * gamma**episode_length) / ((1.0 - gamma) * episode_length)
 
 
 def indicator_joint(cost: th.Tensor, continues: th.Tensor, continue_after_cost: float) -> th.Tensor:

@@ -102,7 +102,8 @@ class AugmentedLagrangian(Penalty):
 
     @property
     def budget(self) -> float:
-        return discounted_budget(self.cost_limit, self.cost_gamma, self.episodes.episode_length)
+        record = self.episodes
+        return discounted_budget(self.cost_limit, self.cost_gamma, record.episode_length, record.timeouts.item())
 
     @property
     def budget_scale(self) -> float:
