@@ -15,6 +15,7 @@ from gymnasium.wrappers import TimeLimit
 from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.noise import NormalActionNoise
+from stable_baselines3.common.torch_layers import FlattenExtractor
 from stable_baselines3.common.type_aliases import MaybeCallback
 from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv
 
@@ -136,6 +137,24 @@ def test_cost_critics_learn_what_a_policy_costs_that_stays(tmp_path: Path) -> No
     model.fit_cost_critic(200, learning_rate=0.005)
     assert moved(model, before) == {"cost_critic", "cost_critic_target"}
     assert expected_cost(model) == pytest.approx(0.53, abs=0.1)
+
+
+class Normalising(FlattenExtractor):
+    """Follows the batches that it sees."""
+
+    def __init__(self, observation_space: spaces.Space) -> None:
+        super().__init__(observation_space)
+        self.norm = th.nn.BatchNorm1d(self.features_dim)
+
+    def forward(self, observations: th.Tensor) -> th.Tensor:
+        return self.norm(super().forward(observations))  # type: ignore[no-any-return]
+
+
+def test_statistics_of_the_model_stay_where_the_cost_critics_learn() -> None:
+    model = make_model(policy_kwargs={**TINY["policy_kwargs"], "features_extractor_class": Normalising}).learn(40)
+    before = {name: value.clone() for name, value in model.policy.state_dict().items()}
+    model.fit_cost_critic(2)
+    assert moved(model, before) == {"cost_critic", "cost_critic_target"}
 
 
 @pytest.mark.parametrize(("imagined_coef", "expected"), [(1.0, 0.27), (100.0, 0.0)])

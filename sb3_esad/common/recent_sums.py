@@ -12,7 +12,8 @@ class RecentSums(nn.Module):
 
     :param names: of the quantities
     :param steps: length of the window, until another is set
-    :param blocks: into how many parts it is cut; the window holds ``steps`` to within a part, or to within one call of ``add``
+    :param blocks: into how many parts it is cut; the window holds ``steps`` to within a part, and a little more where the
+        steps of a call of ``add`` do not divide a part
     """
 
     blocks: th.Tensor

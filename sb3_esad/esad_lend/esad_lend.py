@@ -197,6 +197,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         require(imagined_coef >= 0, "imagined_coef", imagined_coef, "a weight >= 0")
         steps = self.replay_buffer.size() * self.n_envs
         require(self._has_enough_steps(), "replay_buffer.size()", steps, f"{self.learning_starts} steps or more to learn from")
+        self.policy.set_training_mode(False)  # statistics of batches and dropout are the world model's, which stays as it is
         continue_after_cost = self._raise_cost_bound()
         update_learning_rate(self.policy.cost_critic.optimizer, learning_rate)
         for _ in range(gradient_steps):
