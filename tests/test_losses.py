@@ -40,7 +40,7 @@ def steps_of(model: ESADLEND, monkeypatch: pytest.MonkeyPatch) -> dict[str, floa
 
 def weighted(weights: th.Tensor, losses: th.Tensor) -> float:
     """Mean of all losses by their weights."""
-    return float(weights.flatten().double() @ losses.flatten().double()) / losses.numel()
+    return float(weights.flatten().double() @ losses.detach().flatten().double()) / losses.numel()
 
 
 def test_loss_of_the_critics(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -83,7 +83,7 @@ def logged_keys(model: OffPolicyAlgorithm, steps: int) -> set[str]:
     eval_env = VecTransposeImage(DummyVecEnv([lambda: Monitor(Succeeding(PICTURE))]))
     evaluation = CostEvalCallback(eval_env, eval_freq=30, n_eval_episodes=1, verbose=0)
     model.learn(steps, callback=[evaluation, WatchCallback(every=30)], log_interval=1)
-    return recorder.values.keys() | {key for key, _, _ in output.films}
+    return recorder.values.keys() | {key for key, _, _ in (*output.films, *output.histograms)}
 
 
 def test_the_page_explains_every_key_that_there_is() -> None:
