@@ -7,7 +7,6 @@ import gymnasium as gym
 import numpy as np
 import torch as th
 
-from sb3_esad.common.penalties import kept_limit
 from sb3_esad.common.selection import NoFilter
 from sb3_esad.dream import DreamingDriver
 from sb3_esad.esad_lend import ESADLEND
@@ -119,7 +118,7 @@ def _cost(moment: Moment, model: ESADLEND) -> Gauge:
 
 
 def _risk(model: ESADLEND, name: str, risk: float) -> Gauge:
-    limited, budget = kept_limit(model) is not None, model.penalty.budget
+    limited, budget = model.penalty.cost_limit is not None, model.penalty.budget
     allowed = f"budget {100 * budget:.2f} %" if limited else "no limit"
     mark = _risk_share(budget) if limited else None
     colour = BAD if limited and risk > budget else GOOD

@@ -24,8 +24,11 @@ from sb3_esad.common.save_util import whole_file
 CHECKPOINT = "checkpoint.zip"
 """Name of the newest checkpoint in the folder of a run."""
 MODEL, BUFFER, STATISTICS, PROGRESS = "model.zip", "replay_buffer.pkl", "vecnormalize.pkl", "progress.json"
-COUNTED = ("last_time_trigger", "n_episodes", "no_improvement_evals")
-MEMORY = (*COUNTED, "last_best_mean_reward", "best_mean_reward", "last_mean_reward", *EVALUATIONS)
+MEMORY = (
+    *("last_time_trigger", "n_episodes", "no_improvement_evals"),
+    *("best_mean_reward", "last_best_mean_reward", "last_mean_reward"),
+    *EVALUATIONS,
+)
 """What SB3's own callbacks remember, by the names of the attributes."""
 PATIENCE = 0.25
 """Share of the interval, its last, in which a checkpoint waits for the end of an episode."""
