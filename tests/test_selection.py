@@ -18,7 +18,7 @@ from sb3_esad.common.functional import barrier_residual
 from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.penalties import NoPenalty
 from sb3_esad.common.selection import ActionFilter, NoFilter, SafetyFilter, Selection, SelectionRates
-from sb3_esad.common.type_aliases import Belief, LatentState
+from sb3_esad.common.type_aliases import Belief, Imagination, LatentState, Predictions
 from tests.conftest import TINY, CountingEnv
 
 BUDGET_SCALE = AugmentedLagrangian(cost_limit=0.05).budget_scale
@@ -31,10 +31,16 @@ class Known(Foresight):
         super().__init__(steps=1, gamma=0.9, cost_gamma=0.9, risk_level=0.5, barrier_decay=0.3)
         self.calm = calm
 
-    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
-        action = start.action[:, 0]
-        risks = self.at(action) * start.memory[:, 0, 0, 0]
-        return Outlook(action, risks, risks, risks)
+    def imagine(self, agent: LatentAgent, start: LatentState) -> Imagination:
+        stays, nothing = agent.world_model.features(start)[None], th.zeros(1, len(start.action))
+        return Imagination(stays, start.action[None], Predictions(nothing, nothing, nothing), nothing)
+
+    def outlook(self, agent: LatentAgent, imagined: Imagination) -> Outlook:
+        risks = self.risk(agent, imagined.grids[0], imagined.actions[0])
+        return Outlook(risks, risks, risks)
+
+    def values(self, agent: LatentAgent, imagined: Imagination) -> th.Tensor:
+        return imagined.actions[0, :, 0]
 
     def at(self, action: th.Tensor) -> th.Tensor:
         return (action - self.calm).square()
@@ -87,9 +93,9 @@ class Rising(Known):
         super().__init__(calm=0.0)
         self.soon = soon
 
-    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
-        little = th.full_like(start.action[:, 0], 0.5 * BUDGET_SCALE)
-        return Outlook(start.action[:, 0], little, little, th.full_like(little, self.soon * BUDGET_SCALE))
+    def outlook(self, agent: LatentAgent, imagined: Imagination) -> Outlook:
+        little = th.full_like(imagined.actions[0, :, 0], 0.5 * BUDGET_SCALE)
+        return Outlook(little, little, th.full_like(little, self.soon * BUDGET_SCALE))
 
 
 @pytest.mark.parametrize(("soon", "refused"), [(0.6, False), (0.64, False), (0.66, True), (1.0, True)])
@@ -116,8 +122,8 @@ def test_the_choice_is_that_of_brute_force(agent: LatentAgent) -> None:
     assert others.shape == (4, n, 1)
     th.manual_seed(3)
     scenarios, proposed = seen.state.map(lambda field: field[None]), th.full((n, 1), -0.9)
-    own = safety.assess(agent, scenarios, proposed[None])
-    actions, helpless = safety._choose(agent, scenarios, seen.state, proposed, own)
+    own, _ = safety.assess(agent, scenarios, proposed[None])
+    actions, helpless = safety._choose(agent, scenarios, seen.state, proposed, own.risks)
     for state in range(n):
         candidates = [-0.9, *others[:, state, 0].tolist()]
         admissible = [a for a in candidates if (a - 0.2) ** 2 <= BUDGET_SCALE]
@@ -139,17 +145,12 @@ def test_an_action_is_as_risky_as_in_its_worst_scenarios(agent: LatentAgent, ris
     state = agent.world_model.initial(2).map(lambda field: field.expand(4, *field.shape))
     vague = th.tensor([[3.0, 1.0, 4.0, 2.0], [10.0, 20.0, 30.0, 40.0]]).T
     scenarios = state._replace(memory=state.memory + vague[..., None, None, None])
-    outlook = safety.assess(agent, scenarios, th.ones(3, 2, 1))
+    outlook, _ = safety.assess(agent, scenarios, th.ones(3, 2, 1))
     th.testing.assert_close(outlook.risks, th.tensor([expected, 10 * expected]).expand(3, 2))
 
 
 class Sided(Known):
     """In some worlds only what is done to the right is dangerous, in the others only what is done to the left."""
-
-    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
-        action = start.action[:, 0]
-        risks = (action * start.memory[:, 0, 0, 0]).relu()
-        return Outlook(action, risks, risks, risks)
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         return (actions[:, 0] * grids[:, 0, 0, 0]).relu()
@@ -159,7 +160,8 @@ def test_each_action_has_its_own_worst_scenarios(agent: LatentAgent) -> None:
     safety = SafetyFilter(Trusting(0.05), 0, Sided(0.0), risk_level=0.5, n_candidates=4)
     state = agent.world_model.initial(1).map(lambda field: field.expand(4, *field.shape))
     side = th.tensor([1.0, -1.0, 1.0, -1.0]).view(4, 1, 1, 1, 1)
-    outlook = safety.assess(agent, state._replace(memory=state.memory + side), th.tensor([[[0.9]], [[-0.8]], [[0.0]]]))
+    actions = th.tensor([[[0.9]], [[-0.8]], [[0.0]]])
+    outlook, _ = safety.assess(agent, state._replace(memory=state.memory + side), actions)
     th.testing.assert_close(outlook.risks, th.tensor([[0.9], [0.8], [0.0]]))
 
 
@@ -183,12 +185,13 @@ def test_foresight_is_what_model_and_critics_say(agent: LatentAgent, risk_level:
     state = agent.world_model.initial(3)._replace(action=2 * th.rand(3, 1) - 1)
     foresight = Foresight(steps=1, gamma=0.9, cost_gamma=0.8, risk_level=risk_level, barrier_decay=0.3)
     th.manual_seed(0)
-    outlook = foresight(agent, state)
+    imagined = foresight.imagine(agent, state)
+    outlook, values = foresight.outlook(agent, imagined), foresight.values(agent, imagined)
     th.manual_seed(0)
     grid = agent.world_model.features(agent.world_model.rssm.imagine(state))
     rewards, costs, continues = (field[0] for field in agent.world_model.predict(grid[None]))
     action = agent.actor(grid, deterministic=True)
-    th.testing.assert_close(outlook.values, rewards + 0.9 * continues * agent.critic(grid, action).min(0).values)
+    th.testing.assert_close(values, rewards + 0.9 * continues * agent.critic(grid, action).min(0).values)
     means, end_variance = agent.cost_critic(grid, action)
     _, variance = agent.cost_critic(agent.world_model.features(state), state.action)
     to_come = costs + 0.8 * continues * means.max(0).values

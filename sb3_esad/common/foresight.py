@@ -7,20 +7,18 @@ import torch as th
 from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.functional import barrier_residual
 from sb3_esad.common.returns import lambda_return
-from sb3_esad.common.type_aliases import LatentState
+from sb3_esad.common.type_aliases import Imagination, LatentState
 
 
 class Outlook(NamedTuple):
     """
     What is expected of actions, fields of the same shape.
 
-    :param values: return to come
     :param risks: Gamma, the conditional value at risk of the cost to come, as imagined
     :param critic_risks: the same as the critics see it at once
     :param next_risks: as they see it where the actions lead to in m steps, 0 where an episode is over by then
     """
 
-    values: th.Tensor
     risks: th.Tensor
     critic_risks: th.Tensor
     next_risks: th.Tensor
@@ -47,25 +45,44 @@ class Foresight:
         self.risk_level = risk_level
         self.barrier_decay = barrier_decay
 
-    def __call__(self, agent: LatentAgent, start: LatentState) -> Outlook:
+    def imagine(self, agent: LatentAgent, start: LatentState) -> Imagination:
         """
         Look ahead.
 
-        :param agent: whose networks imagine and judge
+        :param agent: whose model and actor imagine
         :param start: N states and the actions taken in them
+        :return: the m steps
+        """
+        return agent.world_model.imagine(start, lambda grid: agent.actor(grid, deterministic=True), self.steps, self.gamma)
+
+    def outlook(self, agent: LatentAgent, imagined: Imagination) -> Outlook:
+        """
+        Tell how dangerous what was imagined is.
+
+        :param agent: whose critics judge
+        :param imagined: m steps from N states
         :return: fields of shape (N,)
         """
-        imagined = agent.world_model.imagine(start, lambda grid: agent.actor(grid, deterministic=True), self.steps, self.gamma)
-        rewards, costs, continues = imagined.predictions
-        ends = imagined.grids[-1], imagined.actions[-1]
+        _, costs, continues = imagined.predictions
         # Beginning and end at once: for so few states it is the number of calls that takes time
         begin_and_end = imagined.grids[[0, -1]].flatten(0, 1), imagined.actions[[0, -1]].flatten(0, 1)
         means, variances = agent.cost_critic(*begin_and_end)
         critic_risks, end_risks = agent.cost_critic.risk(means, variances, self.risk_level).chunk(2)
-        values = _sum_up(rewards, continues, agent.critic(*ends).min(0).values, self.gamma)
         cost_to_come = _sum_up(costs, continues, means.chunk(2, 1)[1].max(0).values, self.cost_gamma)
         risks = agent.cost_critic.risk(cost_to_come[None], variances.chunk(2)[0], self.risk_level)
-        return Outlook(values, risks, critic_risks, continues.prod(0) * end_risks)
+        return Outlook(risks, critic_risks, continues.prod(0) * end_risks)
+
+    def values(self, agent: LatentAgent, imagined: Imagination) -> th.Tensor:
+        """
+        Tell the return to come.
+
+        :param agent: whose critics judge
+        :param imagined: m steps from N states
+        :return: shape (N,)
+        """
+        rewards, _, continues = imagined.predictions
+        end = agent.critic(imagined.grids[-1], imagined.actions[-1]).min(0).values
+        return _sum_up(rewards, continues, end, self.gamma)
 
     def risk(self, agent: LatentAgent, grids: th.Tensor, actions: th.Tensor) -> th.Tensor:
         """

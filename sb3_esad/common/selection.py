@@ -10,7 +10,7 @@ from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.foresight import Foresight, Outlook
 from sb3_esad.common.noise import fixed_seed
 from sb3_esad.common.penalties import Penalty
-from sb3_esad.common.type_aliases import Belief, LatentState, Logs
+from sb3_esad.common.type_aliases import Belief, Imagination, LatentState, Logs
 
 CALMEST = 2
 """How many samples of the actor and how many uniform actions are imagined where the actor's own action is not admissible."""
@@ -178,27 +178,29 @@ class SafetyFilter(ActionFilter):
         if not self.penalty.trusts_critics(self.filter_start):
             return NoFilter().select(agent, belief, proposed)
         scenarios = draw_scenarios(agent, belief, self.n_candidates)
-        own = self.assess(agent, scenarios, proposed[None])
+        own, _ = self.assess(agent, scenarios, proposed[None])
         doubtful = ~self._admissible(own)[0]
         actions, helpless = proposed.clone(), th.zeros_like(doubtful)
         if doubtful.any():
             chosen = scenarios.map(lambda field: field[:, doubtful])
             state = belief.state.map(lambda field: field[doubtful])
-            known = Outlook(*(field[:, doubtful] for field in own))
-            actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, proposed[doubtful], known)
+            known = proposed[doubtful], own.risks[:, doubtful]
+            actions[doubtful], helpless[doubtful] = self._choose(agent, chosen, state, *known)
         return Selection(actions, (actions != proposed).any(1), helpless, own.risks[0])
 
-    def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> Outlook:
+    def assess(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> tuple[Outlook, Imagination]:
         """
         Foresee where actions lead, on average over the scenarios that are the worst for each of them.
 
         :param agent: whose world model and critics judge
         :param scenarios: fields of shape (M, N, ...)
         :param proposals: P actions for each of N states, of shape (P, N, A)
-        :return: fields of shape (P, N)
+        :return: how dangerous that is, fields of shape (P, N), and what was imagined, of all scenarios, actions and states
         """
         states = self._worst(agent, scenarios, proposals).map(lambda field: field.flatten(0, 2))
-        return Outlook(*(field.view(-1, *proposals.shape[:2]).mean(0) for field in self.foresight(agent, states)))
+        imagined = self.foresight.imagine(agent, states)
+        outlook = self.foresight.outlook(agent, imagined)
+        return Outlook(*(_average(field, proposals) for field in outlook)), imagined
 
     def _worst(self, agent: LatentAgent, scenarios: LatentState, proposals: th.Tensor) -> LatentState:
         """For each action the scenarios in which the critics fear it most, with fields of shape (scenarios, P, N, ...)."""
@@ -215,16 +217,17 @@ class SafetyFilter(ActionFilter):
         return self.penalty.admissible(outlook.risks, self.foresight.barrier(outlook, self.penalty.budget_scale))
 
     def _choose(
-        self, agent: LatentAgent, scenarios: LatentState, state: LatentState, proposed: th.Tensor, own: Outlook
+        self, agent: LatentAgent, scenarios: LatentState, state: LatentState, refused: th.Tensor, risks: th.Tensor
     ) -> tuple[th.Tensor, th.Tensor]:
+        """Instead of the refused action the best of others that are admissible; if none is, of all the least risky one."""
         others = self._proposals(agent, state)
-        proposals = th.cat([proposed[None], others])
-        outlook = Outlook(*(th.cat(fields) for fields in zip(own, self.assess(agent, scenarios, others), strict=True)))
+        outlook, imagined = self.assess(agent, scenarios, others)
+        values = _average(self.foresight.values(agent, imagined), others)
         admissible = self._admissible(outlook)
         helpless = ~admissible.any(0)
-        promising = outlook.values.masked_fill(~admissible, -math.inf).argmax(0)
-        best = th.where(helpless, outlook.risks.argmin(0), promising)
-        return proposals[best, th.arange(len(proposed), device=best.device)], helpless
+        promising = 1 + values.masked_fill(~admissible, -math.inf).argmax(0)
+        best = th.where(helpless, th.cat([risks, outlook.risks]).argmin(0), promising)
+        return th.cat([refused[None], others])[best, th.arange(len(refused), device=best.device)], helpless
 
     def _proposals(self, agent: LatentAgent, state: LatentState) -> th.Tensor:
         """Of samples of the actor and of uniform actions those that the critics fear least, of shape (P, N, A)."""
@@ -235,3 +238,8 @@ class SafetyFilter(ActionFilter):
         calmest = risks.view(actions.shape[:3]).topk(CALMEST, dim=1, largest=False).indices
         chosen = actions.gather(1, calmest[..., None].expand(-1, -1, -1, samples.shape[-1]))
         return chosen.flatten(0, 1)
+
+
+def _average(field: th.Tensor, proposals: th.Tensor) -> th.Tensor:
+    """Over scenarios, which come first in a flat field of all scenarios, actions and states; of shape (P, N)."""
+    return field.view(-1, *proposals.shape[:2]).mean(0)
