@@ -10,8 +10,10 @@ import driving
 import pytest
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
+from update_speed import esad_lend
 from upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_AD_END, DOES_NOT_APPLY_TO_LATENTS
 
+from sb3_esad.common.diffusion import DiffusionHead
 from tests.conftest import CountingEnv
 
 SCRIPTS = sorted(
@@ -39,6 +41,12 @@ def test_what_does_not_apply_is_told() -> None:
         for pattern, reason in reasons.items():
             (row,) = (row for row in rows if f"| {concerned} | {reason} |" in row and names_one_of(row, pattern))
             assert row.startswith("| `test_")
+
+
+@pytest.mark.parametrize("diffusion_steps", [0, 2])
+def test_updates_are_timed_with_refined_latents_if_there_are_any(diffusion_steps: int) -> None:
+    head = esad_lend("esad-highway-v0", 10, diffusion_steps).policy.world_model.rssm.head
+    assert head.refines if isinstance(head, DiffusionHead) else diffusion_steps == 0
 
 
 @pytest.mark.parametrize(("total", "steps"), [(20, [8, 16, 20]), (16, [8, 16])])
