@@ -14,7 +14,8 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.save_util import whole_file
-from sb3_esad.driving_evaluation import check_scenario, evaluate_driver, evaluate_model
+from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
+from sb3_esad.envs.scenario import scenario_of
 from sb3_esad.esad_lend import ESADLEND
 from sb3_esad.hyperparams import load_hyperparams
 from sb3_esad.plots import plot_learning_curve
@@ -70,7 +71,7 @@ def run_demo(
     """
     video_writer()
     with closing(gym.make(env_id)) as env:
-        check_scenario(env, env_id)
+        scenario_of(env)
         check_image(env, env_id)
     folder.mkdir(parents=True, exist_ok=True)
     model, training = train(folder, seed, timesteps, minutes, env_id)

@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecEnv, VecFrameStack
 from sb3_esad.common.costs import CostReader
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.envs.episode import Record
-from sb3_esad.envs.scenario import Scenario
+from sb3_esad.envs.scenario import scenario_of
 
 
 class SeededEpisodes(gym.Wrapper[Any, Any, Any, Any]):
@@ -152,7 +152,7 @@ def evaluate_driver(name: str, env_id: str, seeds: Sequence[int]) -> list[Record
     :raises ValueError: if the environment is no driving scenario
     """
     env = _make(env_id, seeds)
-    scenario = check_scenario(env, env_id)
+    scenario = scenario_of(env)
     while not env.finished:
         env.reset()
         driver, done = DRIVERS[name](scenario, env.seed), False
@@ -161,20 +161,6 @@ def evaluate_driver(name: str, env_id: str, seeds: Sequence[int]) -> list[Record
             done = terminated or truncated
     env.close()
     return env.records
-
-
-def check_scenario(env: gym.Env[Any, Any], env_id: str) -> Scenario:
-    """
-    Refuse an environment that scripted drivers do not know their way about in.
-
-    :param env: environment, wrapped or not
-    :param env_id: its name
-    :return: the scenario inside its wrappers
-    :raises ValueError: if it is no driving scenario
-    """
-    if not isinstance(env.unwrapped, Scenario):
-        raise ValueError(f"{env_id} is no driving scenario; scripted drivers and videos need an id that starts with esad-.")
-    return env.unwrapped
 
 
 def check_spaces(model: BaseAlgorithm, env: VecEnv | gym.Env[Any, Any], env_id: str) -> None:

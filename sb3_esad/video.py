@@ -13,7 +13,7 @@ from stable_baselines3.common.base_class import BaseAlgorithm
 from sb3_esad.common.costs import CostReader
 from sb3_esad.common.save_util import whole_file
 from sb3_esad.dream import DreamingDriver
-from sb3_esad.driving_evaluation import check_scenario, check_spaces, normalised
+from sb3_esad.driving_evaluation import check_spaces, normalised
 from sb3_esad.envs.drivers import DRIVERS
 from sb3_esad.envs.scenario import scenario_of
 from sb3_esad.esad_lend import ESADLEND
@@ -140,7 +140,7 @@ def video_writer() -> Any:
 
 def _make(env_id: str) -> gym.Env[Any, Any]:
     with closing(gym.make(env_id)) as env:  # others may not know the mode, and their sentence would not help
-        check_scenario(env, env_id)
+        scenario_of(env)
     return gym.make(env_id, render_mode="rgb_array")
 
 

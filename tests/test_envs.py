@@ -407,5 +407,5 @@ def test_render_shows_a_picture() -> None:
 
 
 def test_scripted_drivers_want_a_scenario() -> None:
-    with pytest.raises(TypeError, match="no driving scenario"):
+    with pytest.raises(ValueError, match="no driving scenario"):
         SpeedKeeper()(gymnasium.make("CartPole-v1"))

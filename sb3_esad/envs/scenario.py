@@ -273,9 +273,10 @@ def scenario_of(env: gymnasium.Env[Any, Any]) -> Scenario:
 
     :param env: a scenario, wrapped or not
     :return: the scenario
-    :raises TypeError: if it is none
+    :raises ValueError: if it is none
     """
     scenario = env.unwrapped
     if not isinstance(scenario, Scenario):
-        raise TypeError(f"{scenario} is no driving scenario; scripted drivers need one of sb3_esad.envs")
+        name = env.spec.id if env.spec else scenario
+        raise ValueError(f"{name} is no driving scenario; scripted drivers and videos need an id that starts with esad-.")
     return scenario
