@@ -73,7 +73,7 @@ def scores(model: WorldModel, samples: SequenceSamples, start: int) -> np.ndarra
         safe = safe * (1 - model.predictions(model.features(state)).costs)
         happens = th.maximum(happens, same * samples.costs[:, start + ahead])
     brier = (1 - safe.unflatten(0, (N_SAMPLES, -1)).mean(0) - happens).square()
-    return th.stack([*energies, brier], 1)[same | (happens > 0)].numpy()
+    return th.stack([*energies, brier], 1)[same | (happens > 0)].cpu().numpy()
 
 
 def interval(differences: np.ndarray) -> str:

@@ -121,7 +121,8 @@ def measure_steps(steps: int, repeats: int) -> None:
         for name, algorithm in (("ESAD-LEND", ESADLEND), ("SAC", SAC)):
             times = []
             for _ in range(repeats):
-                model = algorithm(policy, Monitor(NoSimulator(space)), learning_starts=0, buffer_size=2000, gradient_steps=0)
+                settings: dict[str, Any] = {"learning_starts": 0, "buffer_size": 2000, "gradient_steps": 0, "device": "cpu"}
+                model = algorithm(policy, Monitor(NoSimulator(space)), **settings)
                 with no_networks():
                     times.append(1e3 * step_time(model, steps))
             best[name] = min(times)

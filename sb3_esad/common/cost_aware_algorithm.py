@@ -179,8 +179,10 @@ class CostAwareAlgorithm(WholeFiles):
     def _record(self, logs: dict[str, list[th.Tensor]]) -> None:
         """Log the means of what the updates since the last line have brought."""
         self.logger.record("train/n_updates", self._n_updates, exclude="tensorboard")
-        for name, values in logs.items():
-            self.logger.record_mean(key_of(name), th.stack(values).float().mean().item())
+        if logs:
+            means = th.stack([th.stack(values).float().mean() for values in logs.values()]).tolist()
+            for name, mean in zip(logs, means, strict=True):
+                self.logger.record_mean(key_of(name), mean)
 
     def _setup_learn(
         self,

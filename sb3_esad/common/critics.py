@@ -69,7 +69,7 @@ class QEnsemble(LearningModule):
         :param returns: any shape
         :param rate: share of the new value in the moving average
         """
-        low, high = th.quantile(returns.float(), th.tensor([0.05, 0.95], device=returns.device))
+        low, high = th.quantile(returns.float(), th.linspace(0.05, 0.95, 2, device=returns.device))
         self.scale.add_(rate * ((high - low) - self.scale)).clamp_(min=1.0)
 
     def logits(self, state: PyTorchObs, action: th.Tensor) -> th.Tensor:
@@ -146,11 +146,11 @@ class CostCritic(LearningModule):
 
         :param bound: the largest discounted cost that is possible
         """
-        if bound > self.bound:
-            for network in self.means:
-                *_, output_bias = network.parameters()
-                output_bias.sub_(th.log(bound / self.bound))  # so that small estimates stay what they are
-            self.bound.fill_(bound)
+        raised = self.bound.clamp(min=bound)
+        for network in self.means:
+            *_, output_bias = network.parameters()
+            output_bias.sub_(th.log(raised / self.bound))  # so that small estimates stay what they are
+        self.bound.copy_(raised)
 
     def forward(self, state: PyTorchObs, action: th.Tensor) -> tuple[th.Tensor, th.Tensor]:
         """

@@ -65,7 +65,7 @@ class Foresight:
         """
         _, costs, continues = imagined.predictions
         # Beginning and end at once: for so few states it is the number of calls that takes time
-        begin_and_end = imagined.grids[[0, -1]].flatten(0, 1), imagined.actions[[0, -1]].flatten(0, 1)
+        begin_and_end = (th.cat([field[0], field[-1]]) for field in (imagined.grids, imagined.actions))
         means, variances = agent.cost_critic(*begin_and_end)
         critic_risks, end_risks = agent.cost_critic.risk(means, variances, self.risk_level).chunk(2)
         cost_to_come = _sum_up(costs, continues, means.chunk(2, 1)[1].max(0).values, self.cost_gamma)

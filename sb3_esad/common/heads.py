@@ -90,7 +90,7 @@ class PredictionHeads(nn.Module):
         :return: scalar loss, and its terms
         """
         reward, cost, going_on = self._logits(grid)
-        positive = th.as_tensor(self.cost_weight, device=cost.device)
+        positive = cost.new_full((), self.cost_weight)
         cost_loss = binary_cross_entropy_with_logits(cost, targets.costs, reduction="none", pos_weight=positive)
         terms = {
             "reward_loss": self.distribution.loss(reward, targets.rewards).mean(),

@@ -132,7 +132,7 @@ class AugmentedLagrangian(Penalty):
 
     def forward(self, violation: th.Tensor) -> th.Tensor:
         # (relu(kappa + rho g)^2 - kappa^2) / (2 rho), written so that rho = 0 is the plain Lagrangian.
-        active = violation.clamp(min=-self.multiplier / max(self.penalty_coef, 1e-12))
+        active = violation.clamp(min=-self.multiplier.item() / max(self.penalty_coef, 1e-12))
         return self.multiplier * active + 0.5 * self.penalty_coef * active**2
 
     def combine(self, objective: th.Tensor, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
@@ -160,13 +160,14 @@ class AugmentedLagrangian(Penalty):
     def update(self, violation: float | th.Tensor | None, gradient_steps: int = 1) -> Logs:
         if violation is None:
             return self._logs({})
-        signals = self._signals(float(violation))
+        violation = float(violation)
+        signals = self._signals(violation)
         if self.n_updates >= self.penalty_warmup and signals:
             self._move(list(signals.values()), gradient_steps)
         self.n_updates += gradient_steps
         self._watch_bound(gradient_steps)
         self._watch_critics(gradient_steps)
-        return {**self._logs(signals), "cvar": float(violation) + self.budget}
+        return {**self._logs(signals), "cvar": violation + self.budget}
 
     def _signals(self, violation: float) -> Logs:
         signals = {}

@@ -14,7 +14,8 @@ def has_fast_bfloat16(device: th.device) -> bool:
     :return: whether to use it
     """
     if device.type == "cuda":
-        return th.cuda.is_bf16_supported(including_emulation=False)
+        with th.cuda.device(device):  # for another one may be of another kind
+            return th.cuda.is_bf16_supported(including_emulation=False)
     capabilities = th.cpu.get_capabilities() if device.type == "cpu" else {}
     return bool(capabilities.get("avx512_bf16") or capabilities.get("amx_bf16"))
 

@@ -195,11 +195,12 @@ class RSSM(nn.Module):
         """
         resets = is_first.sum(1).tolist()
         firsts = [LatentState(*fields) for fields in zip(*(field.split(resets) for field in first), strict=True)]
+        places = is_first.nonzero()[:, 1].split(resets)  # not masks, for each makes the host wait for a GPU
         befores, states, posteriors, priors = [], [], [], []
         state = firsts[0]
         for t, (action, embedding) in enumerate(zip(actions.unbind(), embeddings.unbind(), strict=True)):
             if t > 0 and resets[t] > 0:
-                state = _replace(state, is_first[t], firsts[t])
+                state = _replace(state, places[t], firsts[t])
             state = state._replace(action=action)
             befores.append(state)
             memory = self.advance(state)
@@ -218,5 +219,5 @@ def _stack(items: list[Record]) -> Record:
     return type(items[0])(*(join(fields) for fields in zip(*items, strict=True)))
 
 
-def _replace(state: LatentState, mask: th.Tensor, values: LatentState) -> LatentState:
-    return LatentState(*(field.index_put((mask,), value) for field, value in zip(state, values, strict=True)))
+def _replace(state: LatentState, places: th.Tensor, values: LatentState) -> LatentState:
+    return LatentState(*(field.index_put((places,), value) for field, value in zip(state, values, strict=True)))

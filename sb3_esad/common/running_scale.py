@@ -39,8 +39,7 @@ class RunningScale(nn.Module):
 
         :param vectors: shape (N, size)
         """
-        if self.n_batches > 0:
-            vectors = self._bounded(vectors)
+        vectors = th.where(self.n_batches > 0, self._bounded(vectors), vectors)
         self.n_batches += 1
         rate = (1 / self.n_batches).clamp(min=MIN_RATE)
         variance, mean = th.var_mean(vectors, dim=0, correction=0)

@@ -179,9 +179,10 @@ class SafetyFilter(ActionFilter):
             return NoFilter().select(agent, belief, proposed)
         scenarios = draw_scenarios(agent, belief, self.n_candidates)
         own, _ = self.assess(agent, scenarios, proposed[None])
-        doubtful = ~self._admissible(own)[0]
-        actions, helpless = proposed.clone(), th.zeros_like(doubtful)
-        if doubtful.any():
+        refused = ~self._admissible(own)[0]
+        actions, helpless = proposed.clone(), th.zeros_like(refused)
+        doubtful = refused.nonzero().squeeze(1)  # places, for each mask makes the host wait for a GPU
+        if len(doubtful):
             chosen = scenarios.map(lambda field: field[:, doubtful])
             state = belief.state.map(lambda field: field[doubtful])
             known = proposed[doubtful], own.risks[:, doubtful]

@@ -23,10 +23,10 @@ def choose_starts(samples: SequenceSamples, filtered: Filtered, n: int) -> Laten
     eligible = filtered.settled(SETTLING_STEPS, samples.is_first.T)
     usual = (eligible & samples.among_all).float().flatten()
     dangerous = (eligible & (samples.time_to_event.T < EVENT_HORIZON)).float().flatten()
-    chosen = th.cat([_draw(usual, n // 2), _draw(dangerous if dangerous.any() else usual, n - n // 2)])
+    chosen = th.cat([_draw(usual, n // 2), _draw(th.where(dangerous.any(), dangerous, usual), n - n // 2)])
     return filtered.before.map(lambda field: field.flatten(0, 1)[chosen])
 
 
 def _draw(weights: th.Tensor, n: int) -> th.Tensor:
     # A batch of very short windows may hold no eligible state at all; any is then better than none
-    return th.multinomial(weights if weights.any() else th.ones_like(weights), n, replacement=True)
+    return th.multinomial(th.where(weights.any(), weights, 1.0), n, replacement=True)
