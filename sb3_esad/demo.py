@@ -4,8 +4,10 @@ import os
 import platform
 import time
 from collections.abc import Mapping
+from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from importlib.metadata import version
+from multiprocessing import get_context
 from pathlib import Path
 
 import gymnasium as gym
@@ -14,6 +16,7 @@ from stable_baselines3.common.env_util import make_vec_env
 
 from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.save_util import whole_file
+from sb3_esad.common.side_by_side import torch_threads
 from sb3_esad.driving_evaluation import evaluate_driver, evaluate_model
 from sb3_esad.envs.scenario import scenario_of
 from sb3_esad.esad_lend import ESADLEND
@@ -77,13 +80,10 @@ def run_demo(
     model, training = train(folder, seed, timesteps, minutes, env_id)
     seeds = range(UNSEEN, UNSEEN + episodes)
     print(f"Evaluating on {episodes} unseen episodes ...", flush=True)
-    columns = {
-        "ESAD-LEND": summarise_any(evaluate_model(model, env_id, seeds)),
-        "holds speed and lane": summarise_any(evaluate_driver("keeper", env_id, seeds)),
-        "random": summarise_any(evaluate_driver("random", env_id, seeds)),
-    }
+    columns = compare(model, env_id, seeds)
     write_results(folder / "results.md", env_id, columns, training, seeds)
-    record_model(folder / "episode.mp4", model, env_id, seeds[0])
+    with torch_threads(1):
+        record_model(folder / "episode.mp4", model, env_id, seeds[0])
     print(f"\n{format_table(columns)}\n\nIn brackets: 95 % intervals. Written:")
     for name in ("results.md", "learning_curve.png", "episode.mp4", "esad_lend.zip"):
         print(f"  {folder / name}")
@@ -119,6 +119,23 @@ def train(folder: Path, seed: int, timesteps: int, minutes: float, env_id: str) 
     done = f"{model.num_timesteps} steps, {len(history.episodes)} episodes and {model._n_updates} updates"
     wanted = f"at most {model.cost_limit} cost per episode wanted"
     return model, f"Trained for {done} in {took:.1f} minutes with seed {seed}{clock}; {wanted}."
+
+
+@torch_threads(1)  # decisions are too small to share, and the other core is taken
+def compare(model: ESADLEND, env_id: str, seeds: range) -> dict[str, Figures]:
+    """
+    Evaluate a model, and at the same time, in another process, two simple drivers.
+
+    :param model: trained model
+    :param env_id: driving scenario
+    :param seeds: of the episodes
+    :return: figures by the name of the driver
+    """
+    drivers = {"holds speed and lane": "keeper", "random": "random"}
+    with ProcessPoolExecutor(1, get_context("spawn")) as other:
+        driven = {name: other.submit(evaluate_driver, driver, env_id, seeds) for name, driver in drivers.items()}
+        figures = {"ESAD-LEND": summarise_any(evaluate_model(model, env_id, seeds))}
+        return figures | {name: summarise_any(records.result()) for name, records in driven.items()}
 
 
 def write_results(path: Path, env_id: str, columns: Mapping[str, Figures], training: str, seeds: range) -> None:

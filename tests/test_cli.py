@@ -181,7 +181,8 @@ def test_demo(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Ca
     monkeypatch.setattr(demo, "load_hyperparams", lambda *_: Hyperparams(60, 2, {**arguments, "imagination_starts": 8}))
     monkeypatch.setattr(demo, "FIT_UPDATES", 2)
     folder = tmp_path / "new" / "demo"
-    brief = ["--env", SHORT, "--timesteps", "60", "--episodes", "2"]
+    known_in_every_process = f"{__name__}:{SHORT}"
+    brief = ["--env", known_in_every_process, "--timesteps", "60", "--episodes", "2"]
     assert main(["demo", "--out", str(folder), *brief, "--threads", "1", "--seed", "3"]) == 0
     files = {"esad_lend.zip", "learning_curve.png", "results.md", "episode.mp4"}
     assert {path.name for path in folder.iterdir()} == files

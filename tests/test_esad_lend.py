@@ -177,10 +177,10 @@ def test_imagined_costs_count_by_their_weight_where_critics_are_fitted(
     assert expected_cost(model) == pytest.approx(expected, abs=0.1)
 
 
-@pytest.mark.parametrize(("name", "value"), [("imagined_coef", -1.0), ("replay_lambda", 1.5)])
+@pytest.mark.parametrize(("name", "value"), [("gradient_steps", 0), ("imagined_coef", -1.0), ("replay_lambda", 1.5)])
 def test_fitting_needs_arguments_in_their_range(name: str, value: float) -> None:
     with pytest.raises(ValueError, match=f"{name} is {value}; choose"):
-        make_model().fit_cost_critic(1, **{name: value})
+        make_model().fit_cost_critic(**{"gradient_steps": 1, name: value})
 
 
 def test_cost_critics_that_have_never_learned_make_room_for_several_costs() -> None:

@@ -11,6 +11,7 @@ from sb3_esad import ESADLEND
 from sb3_esad.common import latent_algorithm
 from sb3_esad.common.diffusion import DiffusionHead
 from sb3_esad.common.side_by_side import side_by_side
+from sb3_esad.esad_lend import esad_lend
 from tests.conftest import TINY, CountingEnv
 
 CPU = th.device("cpu")
@@ -72,6 +73,19 @@ def test_the_model_is_fitted_while_the_behaviour_learns_as_if_it_came_after(
         monkeypatch.setattr(latent_algorithm, "side_by_side", jobs)
         model = ESADLEND("MlpPolicy", CountingEnv(), **settings).learn(48)
         weights.append(th.nn.utils.parameters_to_vector(model.policy.parameters()))
+    assert th.equal(*weights)
+
+
+@pytest.mark.parametrize("imagined_coef", [0.0, 1.0])
+def test_windows_are_looked_through_while_critics_are_fitted_as_if_it_came_after(
+    imagined_coef: float, two_threads: None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    weights = []
+    for jobs in (side_by_side, one_after_the_other):
+        model = ESADLEND("MlpPolicy", CountingEnv(), **TINY).learn(24)
+        monkeypatch.setattr(esad_lend, "side_by_side", jobs)
+        model.fit_cost_critic(5, imagined_coef=imagined_coef)
+        weights.append(th.nn.utils.parameters_to_vector(model.policy.cost_critic.parameters()))
     assert th.equal(*weights)
 
 

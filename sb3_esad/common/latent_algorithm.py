@@ -152,7 +152,7 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
 
     def _fitting(self, samples: SequenceSamples) -> Callable[[], tuple[Filtered, TensorLogs]]:
         """Draw what is random about a gradient of the world model, and give the job that computes it."""
-        generator = th.Generator(self.device).manual_seed(int(th.randint(2**62, ()).item()))
+        generator = self._own_generator()
 
         def fit() -> tuple[Filtered, TensorLogs]:
             with autocast(self.device):
@@ -161,6 +161,21 @@ class LatentAlgorithm(RecurrentOffPolicyAlgorithm):
             return filtered.detach(), grouped("world_model", logs)
 
         return fit
+
+    def _observing(self, samples: SequenceSamples) -> Callable[[], Filtered]:
+        """Draw what is random about the states of recorded windows, and give the job that finds them."""
+        generator = self._own_generator()
+
+        def observe() -> Filtered:
+            nothing_hidden = th.zeros_like(samples.rewards.T, dtype=th.bool)
+            with autocast(self.device), th.no_grad():
+                return self.policy.world_model.observe(samples, nothing_hidden, generator)
+
+        return observe
+
+    def _own_generator(self) -> th.Generator:
+        """Random numbers for a job beside others, started by torch's global ones."""
+        return th.Generator(self.device).manual_seed(int(th.randint(2**62, ()).item()))
 
     def _step(self, name: str, loss: th.Tensor) -> th.Tensor:
         """Minimise a loss by one step of one network; whatever else it passed through stays."""

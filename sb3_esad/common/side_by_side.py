@@ -26,13 +26,18 @@ def side_by_side(first: Callable[[], First], second: Callable[[], Second], devic
     threads = th.get_num_threads()
     if device.type != "cpu" or threads < 2:
         return first(), second()
-    with _threads(threads // 2), ThreadPoolExecutor(1) as other:
+    with torch_threads(threads // 2), ThreadPoolExecutor(1) as other:
         outcome = other.submit(second)
         return first(), outcome.result()
 
 
 @contextmanager
-def _threads(n: int) -> Iterator[None]:
+def torch_threads(n: int) -> Iterator[None]:
+    """
+    Let torch compute with so many threads.
+
+    :param n: of the calling thread's operations, and of those that start meanwhile
+    """
     before = th.get_num_threads()
     th.set_num_threads(n)
     try:

@@ -1,5 +1,6 @@
 """ESAD-LEND: safe driving from imagined risk (arXiv 2407.06317)."""
 
+from functools import partial
 from typing import Any, ClassVar
 
 import torch as th
@@ -17,6 +18,7 @@ from sb3_esad.common.latent_algorithm import FALLING_RATE
 from sb3_esad.common.policies import LatentPolicy
 from sb3_esad.common.precision import autocast
 from sb3_esad.common.rssm import Filtered
+from sb3_esad.common.side_by_side import side_by_side
 from sb3_esad.common.type_aliases import Imagination, LatentState, SequenceSamples, TensorLogs
 from sb3_esad.esad_lend.policies import CnnPolicy, MlpPolicy, MultiInputPolicy
 from sb3_esad.esad_lend.targets import (
@@ -193,6 +195,7 @@ class ESADLEND(ConstrainedLatentAlgorithm):
             after thousands 0.33 was best on the highway
         :raises ValueError: if an argument is out of its range, or fewer than ``learning_starts`` steps have been recorded
         """
+        require(gradient_steps >= 1, "gradient_steps", gradient_steps, "a number of updates >= 1")
         require(0 <= replay_lambda <= 1, "replay_lambda", replay_lambda, "a number in [0, 1]")
         require(imagined_coef >= 0, "imagined_coef", imagined_coef, "a weight >= 0")
         steps = self.replay_buffer.size() * self.n_envs
@@ -200,19 +203,33 @@ class ESADLEND(ConstrainedLatentAlgorithm):
         self.policy.set_training_mode(False)  # statistics of batches and dropout are the world model's, which stays as it is
         continue_after_cost = self._raise_cost_bound()
         update_learning_rate(self.policy.cost_critic.optimizer, learning_rate)
-        for _ in range(gradient_steps):
-            samples = self._sample(self.batch_size)
-            with autocast(self.device):
+        learn = partial(self._fit_to, replay_lambda, imagined_coef, continue_after_cost)
+        samples = self._sample(self.batch_size)
+        filtered = self._observing(samples)()
+        for _ in range(gradient_steps - 1):
+            following = self._sample(self.batch_size)
+            _, next_filtered = side_by_side(partial(learn, samples, filtered), self._observing(following), self.device)
+            samples, filtered = following, next_filtered
+        learn(samples, filtered)
+
+    def _fit_to(
+        self,
+        replay_lambda: float,
+        imagined_coef: float,
+        continue_after_cost: float,
+        samples: SequenceSamples,
+        filtered: Filtered,
+    ) -> None:
+        """Move the cost critics once; see :meth:`fit_cost_critic`."""
+        with autocast(self.device):
+            recorded = recorded_transitions(self.policy, samples, filtered)
+            loss = self._recorded_cost_losses(recorded, replay_lambda).sum()
+            if imagined_coef > 0:
                 with th.no_grad():
-                    filtered = self.policy.world_model.observe(samples, th.zeros_like(samples.rewards.T, dtype=th.bool))
-                recorded = recorded_transitions(self.policy, samples, filtered)
-                loss = self._recorded_cost_losses(recorded, replay_lambda).sum()
-                if imagined_coef > 0:
-                    with th.no_grad():
-                        imagined = self._imagine(samples, filtered)
-                    targets = self._imagined_cost_targets(imagined, continue_after_cost)
-                    loss = loss + imagined_coef * self._imagined_cost_losses(imagined, targets).sum()
-                self._step("cost_critic", loss)
+                    imagined = self._imagine(samples, filtered)
+                targets = self._imagined_cost_targets(imagined, continue_after_cost)
+                loss = loss + imagined_coef * self._imagined_cost_losses(imagined, targets).sum()
+            self._step("cost_critic", loss)
 
     def _update_actor(self, imagined: Imagination) -> TensorLogs:
         """
