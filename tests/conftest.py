@@ -35,11 +35,11 @@ TINY: dict[str, Any] = {
 
 
 @pytest.fixture(autouse=True)
-def seed() -> Iterator[int]:
+def same_numbers() -> Iterator[None]:
     """The same random numbers and threads for every test, whichever ran before."""
     set_random_seed(0)
     th.set_num_threads(1)
-    yield 0
+    yield
 
 
 class CountingEnv(gym.Env):

@@ -314,13 +314,13 @@ def test_continue_after_cost_is_of_the_steps_that_are_left() -> None:
         assert buffer.continue_after_cost == 0.0
 
 
-def test_same_seed_same_samples(seed: int) -> None:
+def test_same_seed_same_samples() -> None:
     env = make_env(2, episode_length=EPISODE)
     buffer = make_buffer(env, size=200)
     collect(env, [buffer], 60)
 
     def draw() -> SequenceSamples:
-        np.random.seed(seed)
+        np.random.seed(0)
         return buffer.sample(8)
 
     for first, second in zip(draw(), draw(), strict=True):
