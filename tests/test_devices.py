@@ -8,7 +8,9 @@ import torch as th
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from sb3_esad import ESADLEND
+from sb3_esad.common.multipliers import AugmentedLagrangian
 from sb3_esad.common.noise import fixed_seed
+from sb3_esad.common.selection import SafetyFilter
 from tests.conftest import TINY, CountingEnv
 
 PLACES = (th.ops.aten.nonzero,)
@@ -42,19 +44,17 @@ def test_an_update_waits_as_often_however_many_episodes_begin_in_it(episode_leng
 @pytest.mark.parametrize("filter_start", [None, 0])
 def test_a_decision_waits_once_for_what_the_filter_refuses(filter_start: int | None) -> None:
     model = ESADLEND("MlpPolicy", CountingEnv(), filter_start=filter_start, **TINY)
-    model.policy.action_filter.__dict__["penalty"] = Sceptic()
+    if isinstance(model.policy.action_filter, SafetyFilter):
+        model.policy.action_filter.penalty = Sceptic(cost_limit=0.05)
     with Masks() as masks:
         model.predict(model.observation_space.sample())
     assert masks.count == (0 if filter_start is None else 1)
 
 
-class Sceptic:
-    """Trusts the critics, and admits nothing."""
+class Sceptic(AugmentedLagrangian):
+    """Finds all critics calibrated, and admits nothing."""
 
-    budget_scale = 0.01
-
-    def trusts_critics(self, n_updates: int) -> bool:
-        return True
+    calibrated = True
 
     def admissible(self, risk: th.Tensor, barrier: th.Tensor) -> th.Tensor:
         return th.zeros_like(risk, dtype=th.bool)
