@@ -9,7 +9,9 @@ TOO_OLD := "sb3_esad needs Python 3.10 or newer, $(PYTHON) is %d.%d; choose anot
 demo: .venv/.demo
 	$(BIN)/python -m sb3_esad demo
 
-# Two workers, for the tests are many and small; tests/conftest.py gives each of them one thread.
+# Two workers, for the tests are many and small; tests/conftest.py gives each of them one thread. Those that ask for two
+# would else wait for each other by spinning, on cores that the other worker needs.
+test test-lowest: export OMP_WAIT_POLICY = PASSIVE
 test: .venv/.tests
 	$(BIN)/python -m pytest -n 2
 

@@ -121,6 +121,7 @@ def test_traffic_does_not_crash_into_itself_and_merges() -> None:
         ({"reward_weights": {"velocty": 1.0}}, "did you mean 'velocity'"),
         ({"frame": "world"}, "choose one of lane, ego"),
         ({"physics_frequency": 7}, "no multiple"),
+        ({"max_speed": 20.0}, r"start_speed \(22.0, 25.0\) goes beyond max_speed 20.0; lower the one or raise the other"),
         ({"physics_frequency": 0}, "physics_frequency is 0; choose a whole number from 1 on"),
         ({"target_speed": 0}, "target_speed is 0; choose a number above 0"),
         ({"duration": -1.0}, "duration is -1.0; choose a number above 0"),

@@ -13,13 +13,20 @@ from sb3_esad import ESADLEND
 from sb3_esad.common.evaluation import evaluate_policy
 from sb3_esad.common.schedules import HoldThenFall
 
+EPISODES = 100
+SLIP = 0.3
+"""
+Standard deviation of what the wheel adds to the choice. Without it only actions near 0 would differ from their neighbours, and
+an actor that follows gradients would learn from a few samples in a hundred (docs/experiments.md, section 29).
+"""
+
 
 class TwoRoads(gym.Env):
     """
     A junction, and two roads to the same place: a short one of three steps that costs, a long one of six that does not.
 
     The choice is made by the first action of an episode, and nothing that is done afterwards matters. Each step has a
-    reward of -1.
+    reward of -1. With an action of -1 one in two thousand episodes takes the short road.
 
     :param chance: of a cost of 1 in the midst of the short road
     """
@@ -38,7 +45,7 @@ class TwoRoads(gym.Env):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
         if self.road == 0:
-            self.road, self.steps_left = (1, 3) if action[0] > 0 else (-1, 6)
+            self.road, self.steps_left = (1, 3) if action[0] > SLIP * self.np_random.standard_normal() else (-1, 6)
         self.steps_left -= 1
         midway = self.road == 1 and self.steps_left == 1
         cost = float(midway and self.np_random.random() < self.chance)
@@ -67,7 +74,7 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
         batch_size=8,
         sequence_length=8,
         imagination_horizon=4,
-        imagination_starts=96,
+        imagination_starts=384,  # a few in a hundred are at the junction with an action that makes a difference
         uniform_action_prob=0.5,
         tau=0.05,
         ent_coef=0.2,
@@ -86,17 +93,21 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
     ).learn(1500)
 
 
+def costs_of(model: ESADLEND, chance: float, deterministic: bool) -> list[float]:
+    _, _, costs = evaluate_policy(model, make_env(chance), EPISODES, deterministic=deterministic, return_episode_rewards=True)
+    return costs
+
+
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])
 def test_a_limit_makes_it_take_the_long_road(chance: float, seed: int) -> None:
-    limit = 0.2 * chance  # allows the short road in a fifth of the episodes; with two fifths the best action is nearly a tie
+    limit = 0.2 * chance  # of the worst half: it allows the short road in a tenth of all episodes
     model = learn(limit, chance, seed)
-    reward, _, cost = evaluate_policy(model, make_env(chance), 10)
-    assert (reward, cost) == (-6.0, 0.0)
-    _, _, costs = evaluate_policy(model, make_env(chance), 20, deterministic=False, return_episode_rewards=True)
-    assert np.sum(costs) <= binom.ppf(0.99, 20, limit), "more would be seen in 1 % of cases under the limit"
+    often = binom.ppf(0.99, EPISODES, limit)  # more would be seen in 1 % of cases under the limit
+    assert np.sum(costs_of(model, chance, deterministic=True)) <= often
+    assert np.sum(costs_of(model, chance, deterministic=False)) <= often
 
 
 def test_without_a_limit_it_takes_the_short_road() -> None:
     model = learn(cost_limit=None, chance=0.5, seed=1)
-    reward, _, cost = evaluate_policy(model, make_env(0.5), 10)
-    assert reward == -3.0 and np.mean(cost) > 0.2
+    reward, _, _ = evaluate_policy(model, make_env(0.5), EPISODES)
+    assert reward > -3.1
