@@ -7,7 +7,8 @@ union of the vehicle channel, reconstructed and open loop, and the area under th
 
 import argparse
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from itertools import islice
 from typing import Any, NamedTuple
 
 import gymnasium as gym
@@ -76,7 +77,7 @@ def steps(env: gym.Env[Any, Any], seed: int) -> Iterator[Step]:
             observation = following
 
 
-def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int, **kwargs: Any) -> SequenceReplayBuffer:
+def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int) -> SequenceReplayBuffer:
     """
     Fill a replay buffer.
 
@@ -84,15 +85,24 @@ def record(env: gym.Env[Any, Any], n_steps: int, seed: int, length: int, **kwarg
     :param n_steps: how many steps
     :param seed: of scenario and drivers
     :param length: steps in a window
-    :param kwargs: further arguments of the buffer
     :return: the buffer, to which all steps are equally new
     """
     spaces = env.observation_space, env.action_space
-    buffer = SequenceReplayBuffer(n_steps, *spaces, "auto", sequence_length=length, recency=0.0, **kwargs)
-    for _, step in zip(range(n_steps), steps(env, seed), strict=False):
+    buffer = SequenceReplayBuffer(n_steps, *spaces, "auto", sequence_length=length, recency=0.0)
+    add_steps(buffer, islice(steps(env, seed), n_steps))
+    return buffer
+
+
+def add_steps(buffer: SequenceReplayBuffer, recorded: Iterable[Step]) -> None:
+    """
+    Store steps of one environment.
+
+    :param buffer: that stores them
+    :param recorded: the steps
+    """
+    for step in recorded:
         observation, following, action, reward, done = (np.array([field]) for field in step[:-1])
         buffer.add(observation, following, action, reward, done, [step.info])
-    return buffer
 
 
 def overlap(image: th.Tensor, truth: th.Tensor) -> np.ndarray:
