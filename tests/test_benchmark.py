@@ -4,14 +4,21 @@ import json
 import re
 import runpy
 import sys
+from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
+from typing import Any
 
+import diffusion
 import driving
+import numpy as np
 import pytest
+import torch as th
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
 from update_speed import esad_lend
 from upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_AD_END, DOES_NOT_APPLY_TO_LATENTS
+from world_model import Step
 
 from sb3_esad.common.diffusion import DiffusionHead
 from tests.conftest import CountingEnv
@@ -47,6 +54,25 @@ def test_what_does_not_apply_is_told() -> None:
 def test_updates_are_timed_with_refined_latents_if_there_are_any(diffusion_steps: int) -> None:
     head = esad_lend("esad-highway-v0", 10, diffusion_steps).policy.world_model.rssm.head
     assert head.refines if isinstance(head, DiffusionHead) else diffusion_steps == 0
+
+
+def test_no_step_is_foreseen_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    def counted(*args: Any) -> Iterator[Step]:
+        for i in count():
+            yield Step(np.array([i]), np.array([i + 1]), np.zeros(1), 0.0, False, {"cost": 0.0})
+
+    monkeypatch.setattr(diffusion, "steps", counted)
+    (batch,) = diffusion.stretches(CountingEnv(), diffusion.BATCH * diffusion.LENGTH, seed=0)
+    assert isinstance(batch.observations, th.Tensor)
+    assert batch.observations.flatten().tolist() == list(range(diffusion.BATCH * diffusion.LENGTH))
+    foreseen = [start + ahead for start in diffusion.STARTS for ahead in range(1, diffusion.AHEAD[-1] + 1)]
+    assert len(foreseen) == len(set(foreseen)) and max(foreseen) < diffusion.LENGTH
+
+
+def test_energy_score_of_two_samples() -> None:
+    """By hand: at 0 and 2 they are 1 from the truth 1, 2 from the truth 3 in the mean, and 2 from each other."""
+    samples = th.tensor([0.0, 2.0]).view(2, 1, 1).expand(2, 2, 1)
+    assert diffusion.energy_score(samples, th.tensor([[1.0], [3.0]])).tolist() == [0.0, 1.0]
 
 
 @pytest.mark.parametrize(("total", "steps"), [(20, [8, 16, 20]), (16, [8, 16])])
