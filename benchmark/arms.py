@@ -117,10 +117,10 @@ EXPERIMENTS = {
 SCRIPTS: dict[str, list[list[str]]] = {
     "E0": [["diffusion.py", "--env", env_id] for env_id in ("esad-traffic-negotiation-v0", "esad-course-2mps-v0")],
     "E1": [
-        ["driving.py", "esad_lend", "--few-updates", "--save-buffer"],
-        ["variance_loss.py", "runs/esad_lend_0.zip", "runs/esad_lend_0.pkl"],
+        ["driving.py", "esad_lend", "--few-updates", "--save-buffer", "--out", "runs/E1"],
+        ["variance_loss.py", "runs/E1/esad_lend_0.zip", "runs/E1/esad_lend_0.pkl"],
     ],
-    "E8": [["driving.py", "esad_lend", "--seed", seed] for seed in ("0", "1", "2")],
+    "E8": [["driving.py", "esad_lend", "--seed", seed, "--out", "runs/E8"] for seed in ("0", "10", "20")],
     "E10": [["world_model.py"]],
 }
 """Experiments that are no comparison of trainings: what is run one after the other."""

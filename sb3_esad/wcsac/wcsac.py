@@ -25,8 +25,9 @@ class WCSAC(CostLimitedAlgorithm, SAC):
 
     SB3's SAC beside critics of the mean and the variance of the cost to come. The actor minimises SAC's loss plus the weighted
     conditional value at risk of that cost; an augmented Lagrangian moves the weight. Without a limit it acts and learns as SAC
-    does, bit by bit. From the paper differ: the cap of the risk, the squared error of the variance, targets that stop at the
-    end of an episode and the signals of the multiplier, all of them as in :class:`ESADLEND`.
+    does, bit by bit. From the paper differ, all of it as in :class:`ESADLEND`: the risk is capped, and its gradient is that of
+    the mean alone, the larger of two; the variance is learned by the squared error; targets stop at the end of an episode; and
+    the multiplier follows two signals.
 
     :param policy: ``"MlpPolicy"``, ``"CnnPolicy"``, ``"MultiInputPolicy"`` or a :class:`WCSACPolicy`
     :param env: environment with a Box action space, whose info dict holds a cost in [0, 1]
