@@ -7,7 +7,8 @@ import sys
 from collections.abc import Iterator
 from itertools import count
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
+from typing import Any, cast
 
 import diffusion
 import driving
@@ -21,6 +22,7 @@ from upstream_tests import DOES_NOT_APPLY, DOES_NOT_APPLY_TO_AD_END, DOES_NOT_AP
 from world_model import Step
 
 from sb3_esad.common.diffusion import DiffusionHead
+from sb3_esad.common.type_aliases import LatentState, Predictions, SequenceSamples
 from tests.conftest import CountingEnv
 
 SCRIPTS = sorted(
@@ -67,6 +69,30 @@ def test_no_step_is_foreseen_twice(monkeypatch: pytest.MonkeyPatch) -> None:
     assert batch.observations.flatten().tolist() == list(range(diffusion.BATCH * diffusion.LENGTH))
     foreseen = [start + ahead for start in diffusion.STARTS for ahead in range(1, diffusion.AHEAD[-1] + 1)]
     assert len(foreseen) == len(set(foreseen)) and max(foreseen) < diffusion.LENGTH
+
+
+@pytest.mark.parametrize(("continues", "expected"), [(1.0, 1 - 0.9**5), (0.0, 0.1)])
+def test_costs_within_five_steps_are_judged_where_it_is_known_whether_they_came(continues: float, expected: float) -> None:
+    """Windows that go on, that a cost ends after two steps, that end there without one, and of which time is up there."""
+    start, end = diffusion.STARTS[0], diffusion.STARTS[0] + 2
+    samples = SimpleNamespace(
+        actions=th.zeros(4, diffusion.LENGTH, 1),
+        is_first=th.zeros(4, diffusion.LENGTH, dtype=th.bool),
+        costs=th.zeros(4, diffusion.LENGTH),
+        continues=th.ones(4, diffusion.LENGTH),
+    )
+    samples.is_first[1:, end + 1] = True
+    samples.costs[1, end], samples.continues[1:3, end] = 1.0, 0.0
+    state = LatentState(*(th.zeros(diffusion.LENGTH, 4, *shape) for shape in [(2, 1, 1), (2, 1, 1), (1,)]))
+    prediction = Predictions(*(th.full((4 * diffusion.N_SAMPLES,), value) for value in (0.0, 0.1, continues)))
+    rssm = SimpleNamespace(imagine=lambda state: state)
+    model: Any = SimpleNamespace(rssm=rssm, features=lambda state: state, predictions=lambda features: prediction)
+    filtered: Any = SimpleNamespace(states=state)
+    found = diffusion.scores(model, cast(SequenceSamples, samples), filtered, start)
+    assert found[0, :3].tolist() == [0, 0, 0] and found[1:, 0].tolist() == [0, 0, 0] and found[1:, 1:3].isnan().all()
+    assert found[:, 3].tolist() == pytest.approx(
+        [expected**2, (1 - expected) ** 2, expected**2, np.nan], rel=1e-5, nan_ok=True
+    )
 
 
 def test_energy_score_of_two_samples() -> None:
