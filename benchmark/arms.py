@@ -5,8 +5,8 @@ from typing import Any, NamedTuple
 from variants import VARIANTS
 
 IMAGINING = ("esad_lend", "sad_len", "ad_end", *VARIANTS)
-HIGHWAY, BRAKING = "esad-highway-v0", "esad-braking-v0"
-SITUATIONS = (HIGHWAY, "esad-traffic-negotiation-v0", "esad-obstacle-avoidance-v0", BRAKING)
+HIGHWAY, JUNCTION, BRAKING = "esad-highway-v0", "esad-traffic-negotiation-v0", "esad-braking-v0"
+SITUATIONS = (HIGHWAY, JUNCTION, "esad-obstacle-avoidance-v0", BRAKING)
 
 
 class Arm(NamedTuple):
@@ -66,7 +66,7 @@ EXPERIMENTS = {
     ),
     "E4": Experiment(
         "How many steps of diffusion?",
-        (HIGHWAY, "esad-traffic-negotiation-v0"),
+        (HIGHWAY, JUNCTION),
         {f"K = {steps}": Arm("esad_lend", diffusion(steps)) for steps in (0, 1, 2, 3)},
     ),
     "E5": Experiment(
@@ -115,7 +115,7 @@ EXPERIMENTS = {
     ),
 }
 SCRIPTS: dict[str, list[list[str]]] = {
-    "E0": [["diffusion.py", "--env", env_id] for env_id in ("esad-traffic-negotiation-v0", "esad-course-2mps-v0")],
+    "E0": [["diffusion.py", "--env", env_id] for env_id in (BRAKING, JUNCTION, HIGHWAY, "esad-course-2mps-v0")],
     "E1": [
         ["driving.py", "esad_lend", "--few-updates", "--save-buffer", "--out", "runs/E1"],
         ["variance_loss.py", "runs/E1/esad_lend_0.zip", "runs/E1/esad_lend_0.pkl"],
