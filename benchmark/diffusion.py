@@ -188,9 +188,9 @@ def compare(model: WorldModel, others: Windows, levels: list[float], arms: list[
     head.advantage.fill_(-1.0)  # as the gate is while a Gaussian is better
     plain = judge(model, others)
     print(f"  Gaussian: {describe(plain)}, {step_time(model):.1f} ms a step", flush=True)
+    head.advantage.fill_(1.0)
     for level, n_steps in product(levels, arms):
         head.start_level, head.diffusion_steps = level, n_steps
-        head.advantage.fill_(1.0)
         found = judge(model, others)
         print(f"  level {level}, {n_steps} steps: {describe(found)}, {step_time(model):.1f} ms a step")
         print("    less the Gaussian: " + ", ".join(interval(column) for column in (found - plain).T), flush=True)

@@ -93,19 +93,16 @@ def learn(cost_limit: float | None, chance: float, seed: int) -> ESADLEND:
     ).learn(1500)
 
 
-def costs_of(model: ESADLEND, chance: float, deterministic: bool) -> list[float]:
-    _, _, costs = evaluate_policy(model, make_env(chance), EPISODES, deterministic=deterministic, return_episode_rewards=True)
-    return costs
-
-
 @pytest.mark.parametrize(("chance", "seed"), [(1.0, 0), (0.5, 1)])
 def test_a_limit_makes_it_take_the_long_road(chance: float, seed: int) -> None:
     limit = 0.2 * chance
     model = learn(limit, chance, seed)
     # The limit is that of the worst half, so that all episodes may cost half as much; more than this in 1 % of cases then
     often = binom.ppf(0.99, EPISODES, limit / 2)
-    assert np.sum(costs_of(model, chance, deterministic=True)) <= often
-    assert np.sum(costs_of(model, chance, deterministic=False)) <= often
+    _, _, costs = evaluate_policy(model, make_env(chance), EPISODES, deterministic=False, return_episode_rewards=True)
+    assert np.sum(costs) <= often
+    reward, _, _ = evaluate_policy(model, make_env(chance), EPISODES)
+    assert reward < -5.9
 
 
 def test_without_a_limit_it_takes_the_short_road() -> None:

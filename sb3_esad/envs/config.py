@@ -164,13 +164,9 @@ def check_config(config: dict[str, Any]) -> None:
         for name in rule.names:
             if name in config and not rule.holds(config[name]):
                 raise ValueError(f"{name} is {config[name]!r}; choose {rule.remedy}")
-    _check_start(config)
+    start, fastest = config["start_speed"], config["max_speed"]
+    if start[1] > fastest:
+        raise ValueError(f"start_speed {start!r} goes beyond max_speed {fastest!r}; lower the one or raise the other")
     physics, policy = config["physics_frequency"], config["policy_frequency"]
     if physics % policy:
         raise ValueError(f"physics_frequency {physics} is no multiple of policy_frequency {policy}; choose one that is")
-
-
-def _check_start(config: dict[str, Any]) -> None:
-    start, fastest = config.get("start_speed", (0.0, 0.0)), config["max_speed"]
-    if start[1] > fastest:
-        raise ValueError(f"start_speed {start!r} goes beyond max_speed {fastest!r}; lower the one or raise the other")
