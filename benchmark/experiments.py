@@ -1,9 +1,10 @@
 """
-The experiments of docs/experiments.md by name: ``python benchmark/experiments.py E5``.
+The experiments of docs/experiments.md by name: ``python benchmark/experiments.py E3``.
 
 Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept,
 also where the code has changed since: move it away then.
-Those that imagine have the demo's budget: 20,000 steps, about a thousand updates. E0, E1, E8 and E10 are scripts of their own,
+Those that imagine have the demo's budget, 20,000 steps and about a thousand updates, but where the filter needs critics that
+tell the truth (E5) and in an arm of E9: these have the settings of hyperparams/. E0, E1, E8 and E10 are scripts of their own,
 with options of their own. The table pools the last evaluation of all
 seeds: driving score with the interval over seeds, the rest over episodes. Costs in training are counted for each seed, and
 again from the step on at which all arms have begun to learn.
@@ -81,7 +82,7 @@ def train(run: Run, steps: int, episodes: int) -> None:
     script = Path(__file__).with_name("driving.py")
     what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
     how = ["--steps", str(steps), "--every", str(steps // 2), "--episodes", str(episodes), "--threads", "1"]
-    how += ["--few-updates"] if run.arm.algorithm in IMAGINING else []
+    how += ["--few-updates"] if run.arm.few_updates and run.arm.algorithm in IMAGINING else []
     print(f"{run.env_id}, {run.name}, seed {run.seed} ...", flush=True)
     quiet = {"stdout": subprocess.DEVNULL, "env": {**os.environ, "OMP_NUM_THREADS": "1"}}
     subprocess.run([sys.executable, str(script), *what, *how, "--out", str(run.folder)], check=True, **quiet)  # type: ignore[call-overload]

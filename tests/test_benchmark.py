@@ -12,6 +12,7 @@ from typing import Any, cast
 
 import diffusion
 import driving
+import filtered_driving
 import numpy as np
 import pytest
 import torch as th
@@ -99,6 +100,24 @@ def test_energy_score_of_two_samples() -> None:
     """By hand: at 0 and 2 they are 1 from the truth 1, 2 from the truth 3 in the mean, and 2 from each other."""
     samples = th.tensor([0.0, 2.0]).view(2, 1, 1).expand(2, 2, 1)
     assert diffusion.energy_score(samples, th.tensor([[1.0], [3.0]])).tolist() == [0.0, 1.0]
+
+
+def test_a_filter_is_judged_on_the_same_episodes() -> None:
+    crashes = {"without": [1, 1, 1, 0, 0], "filter": [0, 0, 1, 1, 0]}
+    slower = np.array([0.0, -1.0, -2.0, -1.0, -1.0])
+    records = {
+        name: [dict.fromkeys(filtered_driving.COMPARED, 5.0) | {"collisions": float(n)} for n in counts]
+        for name, counts in crashes.items()
+    }
+    for record, change in zip(records["filter"], slower, strict=True):
+        record["mean_speed"] += change
+    paired = filtered_driving.compare(records["without"], records["filter"])
+    assert (paired.prevented, paired.caused) == (2, 1)
+    mean, low, high = paired.changes["mean_speed"]
+    assert mean == pytest.approx(-1.0)
+    assert high - mean == pytest.approx(2.776 * slower.std(ddof=1) / 5**0.5, abs=1e-3)  # Student's t with 4 degrees
+    assert low + high == pytest.approx(-2.0)
+    assert paired.changes["return"] == (0.0, 0.0, 0.0)
 
 
 @pytest.mark.parametrize(("total", "steps"), [(20, [8, 16, 20]), (16, [8, 16])])
