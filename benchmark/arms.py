@@ -15,7 +15,7 @@ class Arm(NamedTuple):
 
     :param algorithm: key of ``ALGORITHMS`` in benchmark/driving.py
     :param changes: arguments of its constructor to replace
-    :param few_updates: as the demo has them, for those that imagine; else as in hyperparams/, which takes four times as long
+    :param few_updates: as the demo has them, for those that imagine; else as in hyperparams/, four times as many
     """
 
     algorithm: str
@@ -30,11 +30,13 @@ class Experiment(NamedTuple):
     :param question: in words
     :param envs: scenarios
     :param arms: by name, the first is what the others are compared with
+    :param steps: of each training
     """
 
     question: str
     envs: tuple[str, ...]
     arms: dict[str, Arm]
+    steps: int = 20_000
 
 
 def diffusion(steps: int) -> dict[str, Any]:
@@ -52,7 +54,7 @@ RECORDED: dict[str, Any] = {
     "replay_lambda": 0.95,
     "min_cost_critic_rate": 1 / 3,
 }
-"""As with the settings of hyperparams/, which the demo's budget, that of all arms that imagine, replaces."""
+"""As with the settings of hyperparams/, which the demo's budget replaces."""
 FILTER: dict[str, Any] = {"filter_start": 300}
 BARRIER: dict[str, Any] = {"barrier_coef": 1.0}
 EXPERIMENTS = {
@@ -80,6 +82,7 @@ EXPERIMENTS = {
             "barrier": Arm("esad_lend", BARRIER, few_updates=False),
             "both": Arm("esad_lend", {**FILTER, **BARRIER}, few_updates=False),
         },
+        steps=15_000,
     ),
     "E6": Experiment(
         "How much entropy?",
@@ -100,9 +103,11 @@ EXPERIMENTS = {
         "Ahead of algorithms without a model?",
         (HIGHWAY, BRAKING),
         {
-            "esad_lend with all updates": Arm("esad_lend", {}, few_updates=False),
-            **{name: Arm(name, {}) for name in ("esad_lend", "sac", "sac_lag", "wcsac")},
+            "all updates": Arm("esad_lend", {}, few_updates=False),
+            "few updates": Arm("esad_lend", {}),
+            **{name: Arm(name, {}) for name in ("sac", "sac_lag", "wcsac")},
         },
+        steps=15_000,
     ),
     "recency": Experiment(
         "Shall what is newer be drawn more often?",
@@ -113,10 +118,11 @@ EXPERIMENTS = {
         "What are diffusion and safety worth?",
         SITUATIONS,
         {
-            "ESAD-LEND": Arm("esad_lend", {**diffusion(2), **FILTER, **BARRIER}),
-            "SAD-LEN": Arm("sad_len", {**FILTER, **BARRIER}),
-            "AD-END": Arm("ad_end", {}),
+            "ESAD-LEND": Arm("esad_lend", {**diffusion(2), **FILTER, **BARRIER}, few_updates=False),
+            "SAD-LEN": Arm("sad_len", {**FILTER, **BARRIER}, few_updates=False),
+            "AD-END": Arm("ad_end", {}, few_updates=False),
         },
+        steps=15_000,
     ),
 }
 SCRIPTS: dict[str, list[list[str]]] = {

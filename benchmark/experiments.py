@@ -3,11 +3,11 @@ The experiments of docs/experiments.md by name: ``python benchmark/experiments.p
 
 Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept,
 also where the code has changed since: move it away then.
-Those that imagine have the demo's budget, 20,000 steps and about a thousand updates, but where the filter needs critics that
-tell the truth (E5) and in an arm of E9: these have the settings of hyperparams/. E0, E1, E8 and E10 are scripts of their own,
-with options of their own. The table pools the last evaluation of all
-seeds: driving score with the interval over seeds, the rest over episodes. Costs in training are counted for each seed, and
-again from the step on at which all arms have begun to learn.
+Those that imagine have the demo's updates, about a thousand in 20,000 steps, but for E5 and the ablations, whose filter waits
+for calibrated critics, and an arm of E9: these have the settings of hyperparams/. E0, E1, E8 and E10 are scripts of their own,
+with options of their own. The table pools the last evaluation of all seeds: driving score with the interval over seeds, the
+rest over episodes. Costs in training are counted for each seed, and again from the step on at which all arms have begun to
+learn.
 """
 
 import argparse
@@ -147,7 +147,7 @@ def main() -> None:
     parser.add_argument("name", choices=[*EXPERIMENTS, *SCRIPTS])
     parser.add_argument("--seeds", type=int, nargs="+", default=SEEDS)
     parser.add_argument("--envs", nargs="+", help="scenarios, instead of all that the experiment has")
-    parser.add_argument("--steps", type=int, default=20_000)
+    parser.add_argument("--steps", type=int, help="of each training, instead of those that the experiment has")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--table", action="store_true", help="print what has been found so far")
@@ -160,7 +160,7 @@ def main() -> None:
     every = list(runs(args.name, args.envs or experiment.envs, args.seeds, args.out))
     if not args.table:
         with ThreadPoolExecutor(2) as two:
-            list(two.map(lambda run: train(run, args.steps, args.episodes), every))
+            list(two.map(lambda run: train(run, args.steps or experiment.steps, args.episodes), every))
     print(f"{args.name}: {experiment.question}\n")
     print_table(every)
 

@@ -1,9 +1,9 @@
 """
-What the filter is worth at the wheel: ``python benchmark/filtered_driving.py MODEL.zip --env esad-braking-v0``.
+What the filter does at the wheel: ``python benchmark/filtered_driving.py MODEL.zip --env esad-braking-v0``.
 
-A trained model drives the same unseen episodes twice, without the filter and with it, so that whatever differs is the filter's
-doing. With ``--buffer`` the cost critics, which the filter believes, are fitted first (see ``benchmark/calibration.py``).
-The filter waits for critics that training has found calibrated; with ``--trust`` it does not.
+A trained model drives the same unseen episodes twice, with the best actions, without the filter and with it. The filter judges
+whatever training has found of the critics, which may have been fitted since; ``--buffer`` fits them first, as in
+``benchmark/calibration.py``.
 """
 
 import argparse
@@ -22,11 +22,17 @@ from sb3_esad.common.type_aliases import Belief
 from sb3_esad.demo import FIT_UPDATES
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.episode import Record
-from sb3_esad.envs.intervals import mean_interval
+from sb3_esad.envs.intervals import mean_interval, wilson_interval
 from sb3_esad.report import format_table, summarise_any
 
-COMPARED = ("return", "cost", "driving_score", "mean_speed", "min_ttc")
-"""Keys of the records whose change by the filter is printed."""
+COMPARED = {
+    "return": ("return", 1.0),
+    "cost": ("cost", 1.0),
+    "driving_score": ("driving score [%]", 100.0),
+    "mean_speed": ("speed [m/s]", 1.0),
+    "min_ttc": ("smallest time to collision [s]", 1.0),
+}
+"""Of a record, what is compared episode by episode: label and factor to its unit by key."""
 
 
 class CountedFilter(SafetyFilter):
@@ -47,15 +53,10 @@ class CountedFilter(SafetyFilter):
         return selection
 
 
-class Counted(ESADLEND):
-    """ESAD-LEND with that filter."""
+class Filtered(ESADLEND):
+    """ESAD-LEND with that filter, at work from the start."""
 
     filter_class = CountedFilter
-
-
-class Trusting(Counted):
-    """ESAD-LEND whose filter does not wait for calibrated critics."""
-
     penalty_class = TrustedCritics
 
 
@@ -65,7 +66,7 @@ class Paired(NamedTuple):
 
     :param prevented: how many have a collision without the filter and none with it
     :param caused: how many have none without it and one with it
-    :param changes: by key of the record, what it has with the filter less what it has without: mean and 95 % interval
+    :param changes: by label, what there is with the filter less what there is without: mean and 95 % interval
     """
 
     prevented: int
@@ -83,10 +84,30 @@ def compare(without: list[Record], filtered: list[Record]) -> Paired:
     """
     before, after = (np.array([record["collisions"] > 0 for record in records]) for records in (without, filtered))
     changes = {}
-    for key in COMPARED:
-        change = np.array([new[key] - old[key] for old, new in zip(without, filtered, strict=True)])
-        changes[key] = (float(change.mean()), *mean_interval(change))
+    for key, (label, scale) in COMPARED.items():
+        change = scale * np.array([new[key] - old[key] for old, new in zip(without, filtered, strict=True)])
+        changes[label] = (float(change.mean()), *mean_interval(change))
     return Paired(int((before & ~after).sum()), int((after & ~before).sum()), changes)
+
+
+def report(without: list[Record], filtered: list[Record], rates: dict[str, float]) -> None:
+    """
+    Print what has been found.
+
+    :param without: records of a driver
+    :param filtered: of the same driver with a filter, in the same order
+    :param rates: how often the filter judged and replaced actions
+    """
+    print(format_table({"without": summarise_any(without), "filter": summarise_any(filtered)}))
+    print("Shares of all actions:", ", ".join(f"{name} {rate:.3f}" for name, rate in rates.items()))
+    paired = compare(without, filtered)
+    print(f"Collisions prevented in {paired.prevented} episodes, caused in {paired.caused}", end="")
+    if differ := paired.prevented + paired.caused:
+        low, high = wilson_interval(paired.prevented, differ)
+        print(f": prevented in {paired.prevented / differ:.2f} [{low:.2f}, {high:.2f}] of those that differ", end="")
+    print("\nWith the filter less without, mean of the episodes:")
+    for label, (change, low, high) in paired.changes.items():
+        print(f"  {label}: {change:+.2f} [{low:+.2f}, {high:+.2f}]")
 
 
 def main() -> None:
@@ -96,26 +117,24 @@ def main() -> None:
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=UNSEEN, help="of the first episode (default: %(default)s)")
-    parser.add_argument("--buffer", type=Path, help="of the model: fit its critics first")
-    parser.add_argument("--imagined-coef", type=float, default=0.33, help="weight of imagined transitions in that fit")
-    parser.add_argument("--trust", action="store_true", help="let the filter judge whether or not critics are calibrated")
+    parser.add_argument("--buffer", type=Path, help="of the model: fit its critics first, which the demo has done")
+    parser.add_argument("--imagined-coef", type=float, default=0.0, help="weight of imagined transitions in that fit")
     args = parser.parse_args()
+    if args.imagined_coef != 0 and args.buffer is None:
+        parser.error(f"--imagined-coef is {args.imagined_coef}, but nothing is fitted: add --buffer")
     th.set_num_threads(1)
-    model = (Trusting if args.trust else Counted).load(args.model, device="cpu", filter_start=0)
+    model = Filtered.load(args.model, device="cpu", filter_start=0)
+    if model.cost_limit is None:
+        parser.error(f"{args.model} has no cost limit and hence no filter: choose a model that was trained with a limit")
     if args.buffer is not None:
         model.load_replay_buffer(args.buffer)
         model.fit_cost_critic(FIT_UPDATES, imagined_coef=args.imagined_coef)
+    # One by one: environments that stand still would be counted, and batches of another size differ in the last digit
     seeds = range(args.seed, args.seed + args.episodes)
     filtered = evaluate_model(model, args.env, seeds, n_envs=1)
     rates = model.policy.action_filter.rates.take()
     model.policy.action_filter = NoFilter()
-    without = evaluate_model(model, args.env, seeds)
-    print(format_table({"without": summarise_any(without), "filter": summarise_any(filtered)}))
-    print(", ".join(f"{name} {rate:.3f}" for name, rate in rates.items()))
-    paired = compare(without, filtered)
-    print(f"Collisions prevented in {paired.prevented} episodes, caused in {paired.caused}")
-    for key, (change, low, high) in paired.changes.items():
-        print(f"{key}: {change:+.3f} [{low:+.3f}, {high:+.3f}]")
+    report(evaluate_model(model, args.env, seeds, n_envs=1), filtered, rates)
 
 
 if __name__ == "__main__":

@@ -102,7 +102,7 @@ def test_energy_score_of_two_samples() -> None:
     assert diffusion.energy_score(samples, th.tensor([[1.0], [3.0]])).tolist() == [0.0, 1.0]
 
 
-def test_a_filter_is_judged_on_the_same_episodes() -> None:
+def test_what_a_filter_changes_is_paired_by_episode() -> None:
     crashes = {"without": [1, 1, 1, 0, 0], "filter": [0, 0, 1, 1, 0]}
     slower = np.array([0.0, -1.0, -2.0, -1.0, -1.0])
     records = {
@@ -113,7 +113,7 @@ def test_a_filter_is_judged_on_the_same_episodes() -> None:
         record["mean_speed"] += change
     paired = filtered_driving.compare(records["without"], records["filter"])
     assert (paired.prevented, paired.caused) == (2, 1)
-    mean, low, high = paired.changes["mean_speed"]
+    mean, low, high = paired.changes["speed [m/s]"]
     assert mean == pytest.approx(-1.0)
     assert high - mean == pytest.approx(2.776 * slower.std(ddof=1) / 5**0.5, abs=1e-3)  # Student's t with 4 degrees
     assert low + high == pytest.approx(-2.0)
