@@ -125,24 +125,49 @@ def plot(path: Path, bins: list[Visits]) -> None:
     figure.savefig(path, dpi=120)
 
 
-def main() -> None:
-    """Drive, compare, draw."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+def add_fit(parser: argparse.ArgumentParser) -> None:
+    """
+    Ask for a model, and whether its critics are to be fitted first.
+
+    :param parser: gets the arguments that :func:`load_fitted` reads
+    """
     parser.add_argument("model", type=Path)
     parser.add_argument("--buffer", type=Path, help="of the model: fit its critics first, which the demo has done")
     parser.add_argument("--imagined-coef", type=float, default=0.0, help="weight of imagined transitions in that fit")
+
+
+def load_fitted(
+    parser: argparse.ArgumentParser, args: argparse.Namespace, algorithm: type[ESADLEND] = ESADLEND, **settings: Any
+) -> ESADLEND:
+    """
+    Load a model, and fit its critics if there is a buffer.
+
+    :param parser: tells of arguments that do not fit together
+    :param args: what :func:`add_fit` asked for
+    :param algorithm: class of the model
+    :param settings: arguments of its constructor to replace
+    :return: the model, on the CPU
+    """
+    if args.imagined_coef != 0 and args.buffer is None:
+        parser.error(f"--imagined-coef is {args.imagined_coef}, but nothing is fitted: add --buffer")
+    model = algorithm.load(args.model, device="cpu", **settings)
+    if args.buffer is not None:
+        model.load_replay_buffer(args.buffer)
+        model.fit_cost_critic(FIT_UPDATES, imagined_coef=args.imagined_coef)
+    return model
+
+
+def main() -> None:
+    """Drive, compare, draw."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    add_fit(parser)
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--steps", type=int, default=60_000)
     parser.add_argument("--n-envs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=UNSEEN)
     parser.add_argument("--out", type=Path, default=Path("calibration.png"))
     args = parser.parse_args()
-    if args.imagined_coef != 0 and args.buffer is None:
-        parser.error(f"--imagined-coef is {args.imagined_coef}, but nothing is fitted: add --buffer")
-    model = ESADLEND.load(args.model, device="cpu")
-    if args.buffer is not None:
-        model.load_replay_buffer(args.buffer)
-        model.fit_cost_critic(FIT_UPDATES, imagined_coef=args.imagined_coef)
+    model = load_fitted(parser, args)
     visits = drive(model, args.env, args.steps, args.n_envs, args.seed)
     bins = by_expectation(visits)
     for name, each in [("all", visits), *((str(index), each) for index, each in enumerate(bins))]:

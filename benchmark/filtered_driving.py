@@ -7,11 +7,11 @@ whatever training has found of the critics, which may have been fitted since; ``
 """
 
 import argparse
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch as th
+from calibration import add_fit, load_fitted
 from driving import UNSEEN
 from predict_latency import TrustedCritics
 
@@ -19,7 +19,6 @@ from sb3_esad import ESADLEND
 from sb3_esad.common.agent import LatentAgent
 from sb3_esad.common.selection import NoFilter, SafetyFilter, Selection, SelectionRates
 from sb3_esad.common.type_aliases import Belief
-from sb3_esad.demo import FIT_UPDATES
 from sb3_esad.driving_evaluation import evaluate_model
 from sb3_esad.envs.episode import Record
 from sb3_esad.envs.intervals import mean_interval, wilson_interval
@@ -113,22 +112,15 @@ def report(without: list[Record], filtered: list[Record], rates: dict[str, float
 def main() -> None:
     """Drive twice and compare."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("model", type=Path)
+    add_fit(parser)
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--episodes", type=int, default=100)
     parser.add_argument("--seed", type=int, default=UNSEEN, help="of the first episode (default: %(default)s)")
-    parser.add_argument("--buffer", type=Path, help="of the model: fit its critics first, which the demo has done")
-    parser.add_argument("--imagined-coef", type=float, default=0.0, help="weight of imagined transitions in that fit")
     args = parser.parse_args()
-    if args.imagined_coef != 0 and args.buffer is None:
-        parser.error(f"--imagined-coef is {args.imagined_coef}, but nothing is fitted: add --buffer")
     th.set_num_threads(1)
-    model = Filtered.load(args.model, device="cpu", filter_start=0)
+    model = load_fitted(parser, args, Filtered, filter_start=0)
     if model.cost_limit is None:
         parser.error(f"{args.model} has no cost limit and hence no filter: choose a model that was trained with a limit")
-    if args.buffer is not None:
-        model.load_replay_buffer(args.buffer)
-        model.fit_cost_critic(FIT_UPDATES, imagined_coef=args.imagined_coef)
     # One by one: environments that stand still would be counted, and batches of another size differ in the last digit
     seeds = range(args.seed, args.seed + args.episodes)
     filtered = evaluate_model(model, args.env, seeds, n_envs=1)
