@@ -77,7 +77,7 @@ def main() -> None:
     parser.add_argument("files", type=Path, nargs="+")
     parser.add_argument("--from", type=int, default=4000, dest="first", help="steps after which a collapse counts")
     args = parser.parse_args()
-    runs = {path.stem: read(path) for path in args.files}
+    runs = {str(path.with_suffix("")): read(path) for path in args.files}
     print("| steps |", " | ".join(runs), "|\n|---|" + "---|" * len(runs))
     longest = max(runs.values(), key=len)
     for index, line in enumerate(longest):

@@ -13,7 +13,7 @@ import numpy as np
 import torch as th
 from calibration import add_fit, load_fitted
 from driving import UNSEEN
-from predict_latency import TrustedCritics
+from predict_latency import TrustedCritics, require_limit
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.agent import LatentAgent
@@ -119,8 +119,7 @@ def main() -> None:
     args = parser.parse_args()
     th.set_num_threads(1)
     model = load_fitted(parser, args, Filtered, filter_start=0)
-    if model.cost_limit is None:
-        parser.error(f"{args.model} has no cost limit and hence no filter: choose a model that was trained with a limit")
+    require_limit(parser, args.model, model)
     # One by one: environments that stand still would be counted, and batches of another size differ in the last digit
     seeds = range(args.seed, args.seed + args.episodes)
     filtered = evaluate_model(model, args.env, seeds, n_envs=1)

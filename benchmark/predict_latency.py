@@ -48,6 +48,18 @@ def load(path: Path | None, filter_start: int | None) -> ESADLEND:
     return model
 
 
+def require_limit(parser: argparse.ArgumentParser, path: Path, model: ESADLEND) -> None:
+    """
+    Refuse a model that has nothing to filter by.
+
+    :param parser: tells of it
+    :param path: of the model
+    :param model: as loaded
+    """
+    if model.cost_limit is None:
+        parser.error(f"{path} has no cost limit and hence no filter: choose a model that was trained with a limit")
+
+
 def times(model: ESADLEND, steps: int) -> np.ndarray:
     """
     Drive.
@@ -76,8 +88,8 @@ def main() -> None:
     parser.add_argument("--steps", type=int, default=1000)
     args = parser.parse_args()
     th.set_num_threads(1)
-    if args.model is not None and ESADLEND.load(args.model, device="cpu").cost_limit is None:
-        parser.error(f"{args.model} has no cost limit and hence no filter: choose a model that was trained with a limit")
+    if args.model is not None:
+        require_limit(parser, args.model, ESADLEND.load(args.model, device="cpu"))
     for name, filter_start in ARMS.items():
         warm = times(load(args.model, filter_start), args.steps)
         print(
