@@ -11,6 +11,7 @@ from types import SimpleNamespace
 from typing import Any, cast
 
 import diffusion
+import dreams
 import driving
 import filtered_driving
 import numpy as np
@@ -94,6 +95,35 @@ def test_costs_within_five_steps_are_judged_where_it_is_known_whether_they_came(
     assert found[:, 3].tolist() == pytest.approx(
         [expected**2, (1 - expected) ** 2, expected**2, np.nan], rel=1e-5, nan_ok=True
     )
+
+
+def test_dreams_are_compared_with_what_is_known_of_their_steps() -> None:
+    """Windows that go on, that a cost ends after two steps, end there without one, whose time is up there, too short."""
+    length, last = dreams.SEEN + dreams.AHEAD, dreams.SEEN + 1
+    samples = SimpleNamespace(
+        actions=th.zeros(5, length, 1),
+        is_first=th.zeros(5, length, dtype=th.bool),
+        costs=th.zeros(5, length),
+        continues=th.ones(5, length),
+    )
+    samples.is_first[0, 0] = samples.is_first[4, dreams.SEEN] = True
+    samples.is_first[1:4, last + 1] = True
+    samples.costs[1, last], samples.continues[1:3, last] = 1.0, 0.0
+    samples.costs[:, last + 2] = 1.0  # of the next episode, but for the first window
+    state = LatentState(*(th.zeros(length, 5, *shape) for shape in [(2, 1, 1), (2, 1, 1), (1,)]))
+    prediction = Predictions(*(th.full((5,), value) for value in (0.0, 0.1, 0.8)))
+    model: Any = SimpleNamespace(
+        rssm=SimpleNamespace(imagine=lambda state: state),
+        features=lambda state: state,
+        predictions=lambda features: prediction,
+        observe=lambda samples, hidden: SimpleNamespace(states=state),
+    )
+    found = dreams.dream(model, cast(SequenceSamples, samples))
+    np.testing.assert_allclose(found.imagined, np.tile(0.1 * 0.8 ** np.arange(dreams.AHEAD), (4, 1)), rtol=1e-5)
+    came = np.zeros((4, dreams.AHEAD))
+    came[0, 3] = came[1, 1] = 1.0
+    assert (found.recorded == came).all()
+    assert found.known[:3].all() and found.known[3].tolist() == [True] * 2 + [False] * (dreams.AHEAD - 2)
 
 
 def test_energy_score_of_two_samples() -> None:
