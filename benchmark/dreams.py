@@ -1,9 +1,10 @@
 """
 Do costs come as often as they are dreamed of? ``python benchmark/dreams.py MODEL.zip --env esad-braking-v0``.
 
-The model drives unseen episodes with sampled actions. After every so many steps its world model goes on without observations
-from what it has seen so far, with the actions that were taken: the cost imagined for each of the next steps is set against
-the costs that came. An actor that learns from dreams fears what they hold, not what the road holds.
+The model drives unseen episodes with sampled actions. In windows of 16 steps, one after the other, the average of its world
+model starts afresh, sees 6 steps and goes on for 10 without observations, with the actions that were taken: the cost imagined
+for each of them is set against the costs that came. An actor that learns from dreams fears what they hold (those of its own
+present actions), not what the road holds.
 """
 
 import argparse
@@ -34,7 +35,7 @@ class Dreams(NamedTuple):
 
     :param imagined: expected cost of each step, times the probability that it is reached
     :param recorded: what came, 0 once the episode is over
-    :param known: whether that is known: not where time was up
+    :param known: False from the step after a time limit on
     """
 
     imagined: np.ndarray
@@ -145,6 +146,10 @@ def main() -> None:
     parser.add_argument("--n-envs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=UNSEEN)
     args = parser.parse_args()
+    if args.steps < (SEEN + AHEAD) * args.n_envs:
+        parser.error(
+            f"--steps is {args.steps}, fewer than {SEEN + AHEAD} for each environment: ask for more, or lower --n-envs"
+        )
     th.set_num_threads(1)
     th.manual_seed(0)
     model = ESADLEND.load(args.model, device="cpu")

@@ -98,10 +98,14 @@ def test_costs_within_five_steps_are_judged_where_it_is_known_whether_they_came(
 
 
 def test_dreams_are_compared_with_what_is_known_of_their_steps() -> None:
-    """Windows that go on, that a cost ends after two steps, end there without one, whose time is up there, too short."""
+    """
+    Of five windows one goes on, one ends by a cost after two steps ahead, one there without a cost, one there by its time
+    limit, and one has a new episode at the first step ahead, so that it is left out.
+    """
     length, last = dreams.SEEN + dreams.AHEAD, dreams.SEEN + 1
+    number = th.arange(length, dtype=th.float32)
     samples = SimpleNamespace(
-        actions=th.zeros(5, length, 1),
+        actions=number.expand(5, length)[..., None],
         is_first=th.zeros(5, length, dtype=th.bool),
         costs=th.zeros(5, length),
         continues=th.ones(5, length),
@@ -110,16 +114,22 @@ def test_dreams_are_compared_with_what_is_known_of_their_steps() -> None:
     samples.is_first[1:4, last + 1] = True
     samples.costs[1, last], samples.continues[1:3, last] = 1.0, 0.0
     samples.costs[:, last + 2] = 1.0  # of the next episode, but for the first window
-    state = LatentState(*(th.zeros(length, 5, *shape) for shape in [(2, 1, 1), (2, 1, 1), (1,)]))
-    prediction = Predictions(*(th.full((5,), value) for value in (0.0, 0.1, 0.8)))
+    states = LatentState(*(number.view(-1, 1, 1, 1, 1).expand(-1, 5, 1, 1, 1) for _ in range(2)), th.zeros(length, 5, 1))
+
+    def imagine(state: LatentState) -> LatentState:
+        """The memory counts on from the last state that was seen, and the actions go with it."""
+        assert th.equal(state.memory.flatten() + 1, state.action.flatten())
+        return state._replace(memory=state.memory + 1)
+
     model: Any = SimpleNamespace(
-        rssm=SimpleNamespace(imagine=lambda state: state),
-        features=lambda state: state,
-        predictions=lambda features: prediction,
-        observe=lambda samples, hidden: SimpleNamespace(states=state),
+        rssm=SimpleNamespace(imagine=imagine),
+        features=lambda state: state.memory.flatten(),
+        predictions=lambda numbers: Predictions(numbers, numbers / 100, th.full_like(numbers, 0.8)),
+        observe=lambda samples, hidden: SimpleNamespace(states=states),
     )
     found = dreams.dream(model, cast(SequenceSamples, samples))
-    np.testing.assert_allclose(found.imagined, np.tile(0.1 * 0.8 ** np.arange(dreams.AHEAD), (4, 1)), rtol=1e-5)
+    expected = number[dreams.SEEN :].numpy() / 100 * 0.8 ** np.arange(dreams.AHEAD)
+    np.testing.assert_allclose(found.imagined, np.tile(expected, (4, 1)), rtol=1e-5)
     came = np.zeros((4, dreams.AHEAD))
     came[0, 3] = came[1, 1] = 1.0
     assert (found.recorded == came).all()
