@@ -17,7 +17,7 @@ from typing import Any
 import gymnasium as gym
 import numpy as np
 import torch as th
-from world_model import add_steps, fit, record, steps
+from world_model import Step, add_steps, fit, record, steps
 
 from sb3_esad import ESADLEND
 from sb3_esad.common.buffers import SequenceReplayBuffer
@@ -34,19 +34,20 @@ SCORES = tuple(f"energy score {ahead} ahead" for ahead in AHEAD) + tuple(f"Brier
 Windows = list[tuple[SequenceSamples, Filtered]]
 
 
-def stretches(env: gym.Env[Any, Any], n_steps: int, seed: int) -> Iterator[SequenceSamples]:
+def stretches(env: gym.Env[Any, Any], driven: Iterator[Step], n_steps: int, length: int = LENGTH) -> Iterator[SequenceSamples]:
     """
-    Drive, and cut what is seen into windows one after the other.
+    Cut what is driven into windows one after the other.
 
     :param env: scenario
-    :param n_steps: about how many steps
-    :param seed: of scenario and drivers
+    :param driven: steps in it
+    :param n_steps: about how many of them
+    :param length: steps of a window
     :return: batches of ``BATCH`` windows, none of which overlap
     """
-    window = SequenceReplayBuffer(LENGTH, env.observation_space, env.action_space, sequence_length=LENGTH, event_fraction=0.0)
-    driven, batch = steps(env, seed), []
-    for _ in range(n_steps // LENGTH):
-        add_steps(window, islice(driven, LENGTH))
+    spaces, batch = (env.observation_space, env.action_space), []
+    window = SequenceReplayBuffer(length, *spaces, sequence_length=length, event_fraction=0.0)
+    for _ in range(n_steps // length):
+        add_steps(window, islice(driven, length))
         batch.append(window.sample(1))
         if len(batch) == BATCH:
             yield SequenceSamples(*map(th.cat, zip(*batch, strict=True)))
@@ -217,7 +218,7 @@ def main() -> None:
         updates, model = fit(algorithm, args.seconds), algorithm.policy.world_model
         print(f"{args.env}, seed {seed}: {updates} updates")
         with th.no_grad(), autocast(algorithm.device):
-            windows = stretches(env, args.others, 1000 + seed)
+            windows = stretches(env, steps(env, 1000 + seed), args.others)
             others = [(each, model.observe(each, th.zeros_like(each.is_first.T))) for each in windows]
             compare(model, others, args.levels, args.diffusion_steps)
 

@@ -9,17 +9,17 @@ present actions), not what the road holds.
 
 import argparse
 from collections.abc import Iterator
-from functools import partial
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium as gym
 import numpy as np
 import torch as th
-from stable_baselines3.common.vec_env import DummyVecEnv
+from diffusion import BATCH, stretches
+from world_model import Step
 
 from sb3_esad import ESADLEND
-from sb3_esad.common.buffers import SequenceReplayBuffer
 from sb3_esad.common.type_aliases import SequenceSamples
 from sb3_esad.common.world_model import WorldModel
 from sb3_esad.envs.intervals import poisson_interval
@@ -43,46 +43,24 @@ class Dreams(NamedTuple):
     known: np.ndarray
 
 
-def driven(model: ESADLEND, env_id: str, n_steps: int, n_envs: int, seed: int) -> SequenceReplayBuffer:
+def steps(model: ESADLEND, env: gym.Env[Any, Any], seed: int) -> Iterator[Step]:
     """
-    Let the policy drive, with sampled actions, and record it.
+    Let the policy drive, with sampled actions.
 
     :param model: trained model
-    :param env_id: scenario
-    :param n_steps: in all
-    :param n_envs: environments side by side
-    :param seed: of the first environment
-    :return: the steps
+    :param env: scenario
+    :param seed: of the first episode
+    :return: endless steps
     """
-    env = DummyVecEnv([partial(gym.make, env_id)] * n_envs)
-    spaces = env.observation_space, env.action_space
-    buffer = SequenceReplayBuffer(n_steps, *spaces, "cpu", n_envs, sequence_length=SEEN + AHEAD, event_fraction=0.0)
-    env.seed(seed)
-    observation: Any = env.reset()
-    following: Any
-    state, starts = None, np.ones(n_envs, dtype=bool)
-    for _ in range(n_steps // n_envs):
-        action, state = model.predict(observation, state, starts)
-        following, rewards, starts, infos = env.step(action)
-        reached = following.copy()
-        for index in np.flatnonzero(starts):
-            reached[index] = infos[index]["terminal_observation"]
-        buffer.add(observation, reached, model.policy.scale_action(action), rewards, starts, infos)
-        observation = following
-    return buffer
-
-
-def windows(buffer: SequenceReplayBuffer) -> Iterator[SequenceSamples]:
-    """
-    Cut what was recorded into windows one after the other.
-
-    :param buffer: recorded steps
-    :return: for each stretch of ``SEEN`` + ``AHEAD`` steps a window of each environment
-    """
-    length, envs = SEEN + AHEAD, np.arange(buffer.n_envs)[:, None]
-    for begin in range(0, buffer.size() - length + 1, length):
-        steps = np.full_like(envs, begin) + np.arange(length)
-        yield buffer._get_sequences(steps, envs, 0, 0.0, None)
+    for episode_seed in count(seed):
+        (observation, _), state, done = env.reset(seed=episode_seed), None, False
+        while not done:
+            action, state = model.predict(observation, state)
+            following, reward, terminated, truncated, info = env.step(action)
+            done = terminated or truncated
+            scaled, info = model.policy.scale_action(action), {**info, "TimeLimit.truncated": truncated and not terminated}
+            yield Step(observation, following, scaled, float(reward), done, info)
+            observation = following
 
 
 def dream(model: WorldModel, samples: SequenceSamples) -> Dreams:
@@ -93,12 +71,13 @@ def dream(model: WorldModel, samples: SequenceSamples) -> Dreams:
     :param samples: windows
     :return: costs ahead in those windows whose first ``SEEN`` steps, and the next, belong to one episode
     """
-    begins = samples.is_first & (th.arange(SEEN + AHEAD) > 0)
+    begins = samples.is_first.clone()
+    begins[:, 0] = False
     over = begins[:, SEEN:].cumsum(1) > 0
     cut = (begins & (samples.continues.roll(1, 1) > 0))[:, SEEN:].cumsum(1) > 0
     usable = ~begins[:, : SEEN + 1].any(1)
     fields = imagine_costs(model, samples), samples.costs[:, SEEN:] * ~over, ~cut
-    return Dreams(*(field[usable].numpy() for field in fields))
+    return Dreams(*(field[usable].cpu().numpy() for field in fields))
 
 
 @th.no_grad()
@@ -110,15 +89,11 @@ def imagine_costs(model: WorldModel, samples: SequenceSamples) -> th.Tensor:
     :param samples: B windows
     :return: expected cost of each step, times the probability that the episode gets there, of shape (B, AHEAD)
     """
-    filtered = model.observe(samples, th.zeros_like(samples.is_first.T))
-    state, alive = filtered.states.map(lambda field: field[SEEN - 1]), th.ones(len(samples.costs))
-    costs = []
-    for action in samples.actions[:, SEEN:].unbind(1):
-        state = model.rssm.imagine(state._replace(action=action))
-        expected = model.predictions(model.features(state))
-        costs.append(alive * expected.costs)
-        alive = alive * expected.continues
-    return th.stack(costs, 1)
+    seen = model.observe(samples, th.zeros_like(samples.is_first.T)).states.map(lambda field: field[SEEN - 1])
+    first, *following = samples.actions[:, SEEN:].unbind(1)
+    actions = iter([*following, first])  # the last one is not executed
+    imagined = model.imagine(seen._replace(action=first), lambda grid: next(actions), AHEAD, gamma=1.0)
+    return (imagined.weights * imagined.predictions.costs).T
 
 
 def row(name: str, dreams: Dreams, columns: list[int]) -> str:
@@ -143,18 +118,16 @@ def main() -> None:
     parser.add_argument("model", type=Path)
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--steps", type=int, default=20_000)
-    parser.add_argument("--n-envs", type=int, default=20)
     parser.add_argument("--seed", type=int, default=UNSEEN)
     args = parser.parse_args()
-    if args.steps < (SEEN + AHEAD) * args.n_envs:
-        parser.error(
-            f"--steps is {args.steps}, fewer than {SEEN + AHEAD} for each environment: ask for more, or lower --n-envs"
-        )
+    if args.steps < (SEEN + AHEAD) * BATCH:
+        parser.error(f"--steps is {args.steps}: ask for {(SEEN + AHEAD) * BATCH}, a batch of windows, or more")
     th.set_num_threads(1)
     th.manual_seed(0)
-    model = ESADLEND.load(args.model, device="cpu")
-    buffer = driven(model, args.env, args.steps, args.n_envs, args.seed)
-    found = [dream(model.policy.world_model_target, samples) for samples in windows(buffer)]
+    model = ESADLEND.load(args.model)
+    env, average = gym.make(args.env), model.policy.world_model_target
+    windows = stretches(env, steps(model, env, args.seed), args.steps, SEEN + AHEAD)
+    found = [dream(average, samples) for samples in windows]
     dreams = Dreams(*(np.concatenate(field) for field in zip(*found, strict=True)))
     print("| steps ahead | costs imagined in 1,000 steps | that came | in all |\n|---|---|---|---|")
     for step in range(AHEAD):

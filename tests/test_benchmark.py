@@ -4,7 +4,7 @@ import json
 import re
 import runpy
 import sys
-from collections.abc import Iterator
+from functools import partial
 from itertools import count
 from pathlib import Path
 from types import SimpleNamespace
@@ -25,6 +25,7 @@ from world_model import Step
 
 from sb3_esad.common.diffusion import DiffusionHead
 from sb3_esad.common.type_aliases import LatentState, Predictions, SequenceSamples
+from sb3_esad.common.world_model import WorldModel
 from tests.conftest import CountingEnv
 
 SCRIPTS = sorted(
@@ -60,13 +61,9 @@ def test_updates_are_timed_with_refined_latents_if_there_are_any(diffusion_steps
     assert head.refines if isinstance(head, DiffusionHead) else diffusion_steps == 0
 
 
-def test_no_step_is_foreseen_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    def counted(*args: Any) -> Iterator[Step]:
-        for i in count():
-            yield Step(np.array([i]), np.array([i + 1]), np.zeros(1), 0.0, False, {"cost": 0.0})
-
-    monkeypatch.setattr(diffusion, "steps", counted)
-    (batch,) = diffusion.stretches(CountingEnv(), diffusion.BATCH * diffusion.LENGTH, seed=0)
+def test_no_step_is_foreseen_twice() -> None:
+    counted = (Step(np.array([i]), np.array([i + 1]), np.zeros(1), 0.0, False, {"cost": 0.0}) for i in count())
+    (batch,) = diffusion.stretches(CountingEnv(), counted, diffusion.BATCH * diffusion.LENGTH)
     assert isinstance(batch.observations, th.Tensor)
     assert batch.observations.flatten().tolist() == list(range(diffusion.BATCH * diffusion.LENGTH))
     foreseen = [start + ahead for start in diffusion.STARTS for ahead in range(1, diffusion.AHEAD[-1] + 1)]
@@ -121,12 +118,16 @@ def test_dreams_are_compared_with_what_is_known_of_their_steps() -> None:
         assert th.equal(state.memory.flatten() + 1, state.action.flatten())
         return state._replace(memory=state.memory + 1)
 
+    def predictions(numbers: th.Tensor) -> Predictions:
+        return Predictions(numbers, numbers / 100, th.full_like(numbers, 0.8))
+
     model: Any = SimpleNamespace(
         rssm=SimpleNamespace(imagine=imagine),
-        features=lambda state: state.memory.flatten(),
-        predictions=lambda numbers: Predictions(numbers, numbers / 100, th.full_like(numbers, 0.8)),
+        features=lambda state: state.memory,
+        predict=lambda grids: predictions(grids[..., 0, 0, 0]),
         observe=lambda samples, hidden: SimpleNamespace(states=states),
     )
+    model.imagine = partial(WorldModel.imagine, model)
     found = dreams.dream(model, cast(SequenceSamples, samples))
     expected = number[dreams.SEEN :].numpy() / 100 * 0.8 ** np.arange(dreams.AHEAD)
     np.testing.assert_allclose(found.imagined, np.tile(expected, (4, 1)), rtol=1e-5)
