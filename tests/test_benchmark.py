@@ -137,6 +137,15 @@ def test_dreams_are_compared_with_what_is_known_of_their_steps() -> None:
     assert found.known[:3].all() and found.known[3].tolist() == [True] * 2 + [False] * (dreams.AHEAD - 2)
 
 
+def test_dreams_are_scored_by_their_squared_error() -> None:
+    """Of three windows one is not known at the second step: (.1 - 1)^2 and (.3 - 0)^2 there, a cost of two."""
+    imagined, recorded = np.array([[0.5, 0.1], [0.0, 0.3], [0.0, 0.9]]), np.array([[0.0, 1.0], [0.0, 0.0], [1.0, 1.0]])
+    found = dreams.Dreams(imagined, recorded, np.array([[True, True], [True, True], [True, False]]))
+    name, foreseen, came, count, score = dreams.row("2", found, [1]).strip("| ").split(" | ")
+    assert (name, foreseen, count, score) == ("2", "200.00", "1", "450.00")
+    assert came.startswith("500.00 [")
+
+
 def test_energy_score_of_two_samples() -> None:
     """By hand: at 0 and 2 they are 1 from the truth 1, 2 from the truth 3 in the mean, and 2 from each other."""
     samples = th.tensor([0.0, 2.0]).view(2, 1, 1).expand(2, 2, 1)

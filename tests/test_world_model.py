@@ -169,13 +169,23 @@ def test_imagining_one_step_is_the_prior(kind: str, deterministic: None) -> None
     th.testing.assert_close(imagined.actions, th.stack([start.action, *[th.full((5, 2), 0.5)] * 2]))
 
 
-def test_samples_follow_the_distribution() -> None:
-    head = make_policy(VECTOR).world_model.rssm.head
+@pytest.mark.parametrize("temperature", [0.0, 0.5, 1.0])
+def test_samples_follow_the_distribution_at_a_temperature(temperature: float) -> None:
+    head = make_policy(VECTOR, head_kwargs={"temperature": temperature}).world_model.rssm.head
     memory = th.randn(2, 8, 1, 1)
     with th.no_grad():
         prior, drawn = head.prior(memory), head.sample(memory, n_candidates=4000).unflatten(0, (4000, 2))
     th.testing.assert_close(drawn.mean(0), prior.mean, atol=0.08, rtol=0)
-    th.testing.assert_close(drawn.std(0), prior.std, atol=0.05, rtol=0)
+    th.testing.assert_close(drawn.std(0), temperature * prior.std, atol=0.05, rtol=0)
+
+
+def test_what_is_observed_has_no_temperature() -> None:
+    head = make_policy(VECTOR, head_kwargs={"temperature": 0.0}).world_model.rssm.head
+    memory, embedding = th.randn(2, 8, 1, 1), th.randn(2, 8, 1, 1)
+    with th.no_grad():
+        posterior = head.posterior(memory, embedding)
+        drawn = head.sample(memory, embedding, n_candidates=4000).unflatten(0, (4000, 2))
+    th.testing.assert_close(drawn.std(0), posterior.std, atol=0.05, rtol=0)
 
 
 def test_weights_are_the_discounted_chance_to_get_there(deterministic: None) -> None:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import torch as th
 from torch import nn
 
+from sb3_esad.common.checks import require
 from sb3_esad.common.torch_layers import ChannelNorm, GridShape, SameConv2d, conv_block, kernel_size
 from sb3_esad.common.type_aliases import TensorLogs
 
@@ -143,6 +144,9 @@ class GaussianHead(LatentHead):
     :param dynamics_scale: weight of the KL that moves the prior
     :param representation_scale: weight of the KL that moves the posterior
     :param free_nats: divergence below which neither is moved
+    :param temperature: factor of the prior's standard deviation in samples of it; 0 takes its mean (docs/experiments.md,
+        section 32)
+    :raises ValueError: if ``temperature`` is out of its range
     """
 
     def __init__(
@@ -154,11 +158,14 @@ class GaussianHead(LatentHead):
         dynamics_scale: float = 0.5,
         representation_scale: float = 0.1,
         free_nats: float = 1.0,
+        temperature: float = 1.0,
     ) -> None:
         super().__init__()
+        require(0 <= temperature <= 1, "temperature", temperature, "a factor in [0, 1]")
         kernel = kernel_size(memory_shape)
         self.scales = (dynamics_scale, representation_scale)
         self.free_nats = free_nats
+        self.temperature = temperature
         self.embedding_net = SameConv2d(embedding_channels, hidden_channels, 1)
         self.memory_net = SameConv2d(memory_shape[0], hidden_channels, kernel)
         self.prior_net = nn.Sequential(
@@ -184,7 +191,11 @@ class GaussianHead(LatentHead):
         n_candidates: int = 1,
         generator: th.Generator | None = None,
     ) -> th.Tensor:
-        gaussian = self.prior(memory) if embedding is None else self.posterior(memory, embedding)
+        if embedding is None:
+            prior = self.prior(memory)
+            gaussian = prior._replace(std=self.temperature * prior.std)
+        else:
+            gaussian = self.posterior(memory, embedding)
         return Gaussian(*(th.cat([parameter] * n_candidates) for parameter in gaussian)).sample(generator)
 
     def loss(
