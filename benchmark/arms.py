@@ -49,6 +49,16 @@ def diffusion(steps: int) -> dict[str, Any]:
     return {"policy_kwargs": {"head_kwargs": {"diffusion_steps": steps}}}
 
 
+def temperature(factor: float) -> dict[str, Any]:
+    """
+    Set the temperature of dreams.
+
+    :param factor: of the prior's spread
+    :return: arguments of the constructor
+    """
+    return {"policy_kwargs": {"head_kwargs": {"temperature": factor}}}
+
+
 RECORDED: dict[str, Any] = {
     "replay_cost_critic_coef": 10.0,
     "replay_lambda": 0.95,
@@ -113,6 +123,18 @@ EXPERIMENTS = {
         "Shall what is newer be drawn more often?",
         (HIGHWAY, BRAKING),
         {"newer": Arm("esad_lend", {}), "all alike": Arm("esad_lend", {"replay_buffer_kwargs": {"recency": 0.0}})},
+    ),
+    "crawl": Experiment(
+        "Why does it crawl where cars brake?",
+        (BRAKING,),
+        {
+            "as it is": Arm("esad_lend", {}, few_updates=False),
+            "steady model": Arm("steady_model", {}, few_updates=False),
+            "temperature 0.5": Arm("steady_model", temperature(0.5), few_updates=False),
+            "temperature 0": Arm("steady_model", temperature(0.0), few_updates=False),
+            "looks 4 s ahead": Arm("steady_model", {**temperature(0.0), "cost_gamma": 0.95}, few_updates=False),
+        },
+        steps=15_000,
     ),
     "ablations": Experiment(
         "What are diffusion and safety worth?",

@@ -4,10 +4,10 @@ The experiments of docs/experiments.md by name: ``python benchmark/experiments.p
 Every arm is a training with ``benchmark/driving.py`` in a process of its own, two at a time; what has been finished is kept,
 also where the code has changed since: move it away then.
 Those that imagine have the demo's updates, about a thousand in 20,000 steps, but for E5 and the ablations, whose filter waits
-for calibrated critics, and an arm of E9: these have the settings of hyperparams/. E0, E1, E8 and E10 are scripts of their own,
-with options of their own. The table pools the last evaluation of all seeds: driving score with the interval over seeds, the
-rest over episodes. Costs in training are counted for each seed, and again from the step on at which all arms have begun to
-learn.
+for calibrated critics, the crawl and an arm of E9: these have the settings of hyperparams/. E0, E1, E8 and E10 are scripts of
+their own, with options of their own. The table pools the last evaluation of all seeds: driving score with the interval over
+seeds, the rest over episodes. Costs in training are counted for each seed, and again from the step on at which all arms have
+begun to learn.
 """
 
 import argparse
@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from arms import EXPERIMENTS, IMAGINING, SCRIPTS, Arm
+from driving import UNSEEN
 
 from sb3_esad.envs.intervals import mean_interval, wilson_interval
 
@@ -69,19 +70,21 @@ def runs(name: str, envs: Sequence[str], seeds: list[int], out: Path) -> Iterato
                 yield Run(env_id, arm_name, arm, seed, out / name / env_id / arm_name.replace(" ", "_"))
 
 
-def train(run: Run, steps: int, episodes: int) -> None:
+def train(run: Run, steps: int, episodes: int, unseen: int) -> None:
     """
     Train and evaluate on a thread of its own, unless that has been done.
 
     :param run: which
     :param steps: of the training
     :param episodes: of each evaluation
+    :param unseen: seed of their first
     """
     if run.curve.exists() and json.loads(run.curve.read_text().splitlines()[-1])["steps"] >= steps:
         return
     script = Path(__file__).with_name("driving.py")
     what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
     how = ["--steps", str(steps), "--every", str(steps // 2), "--episodes", str(episodes), "--threads", "1"]
+    how += ["--unseen", str(unseen)]
     how += ["--few-updates"] if run.arm.few_updates and run.arm.algorithm in IMAGINING else []
     print(f"{run.env_id}, {run.name}, seed {run.seed} ...", flush=True)
     quiet = {"stdout": subprocess.DEVNULL, "env": {**os.environ, "OMP_NUM_THREADS": "1"}}
@@ -149,6 +152,7 @@ def main() -> None:
     parser.add_argument("--envs", nargs="+", help="scenarios, instead of all that the experiment has")
     parser.add_argument("--steps", type=int, help="of each training, instead of those that the experiment has")
     parser.add_argument("--episodes", type=int, default=100)
+    parser.add_argument("--unseen", type=int, default=UNSEEN, help="see benchmark/driving.py")
     parser.add_argument("--out", type=Path, default=Path("runs"))
     parser.add_argument("--table", action="store_true", help="print what has been found so far")
     args = parser.parse_args()
@@ -160,7 +164,7 @@ def main() -> None:
     every = list(runs(args.name, args.envs or experiment.envs, args.seeds, args.out))
     if not args.table:
         with ThreadPoolExecutor(2) as two:
-            list(two.map(lambda run: train(run, args.steps or experiment.steps, args.episodes), every))
+            list(two.map(lambda run: train(run, args.steps or experiment.steps, args.episodes, args.unseen), every))
     print(f"{args.name}: {experiment.question}\n")
     print_table(every)
 

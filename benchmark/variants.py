@@ -99,8 +99,18 @@ class RoadOnly(ESADLEND):
     penalty_class = RoadOnlyPenalty
 
 
+class SteadyModel(ESADLEND):
+    """Crawl: the world model, too, goes on learning at the least rate of the cost critics, after a policy that changes."""
+
+    def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
+        super()._update_learning_rate(optimizers)
+        for group in self.policy.world_model.optimizer.param_groups:
+            group["lr"] = max(group["lr"], self.min_cost_critic_rate * self.lr_schedule(1))
+
+
 VARIANTS: dict[str, type[ESADLEND]] = {
     "gaussian_risk": GaussianRisk,
     "critics_only": CriticsOnly,
     "road_only": RoadOnly,
+    "steady_model": SteadyModel,
 }

@@ -8,6 +8,7 @@ import torch as th
 from calibration import Visits, by_expectation
 from driving import ALGORITHMS
 from gymnasium import spaces
+from stable_baselines3.common.logger import configure
 from variance_loss import WassersteinCostCritic, WassersteinPolicy
 from variants import VARIANTS, CriticsOnlyPenalty, GaussianCostCritic, RoadOnlyPenalty
 
@@ -15,6 +16,7 @@ from sb3_esad import ESADLEND
 from sb3_esad.common.critics import CostCritic
 from sb3_esad.common.imagined_returns import imagined_costs
 from sb3_esad.common.multipliers import AugmentedLagrangian
+from sb3_esad.common.schedules import HoldThenFall
 from sb3_esad.common.torch_layers import GridReadout
 from tests.conftest import RandomEnv
 from tests.test_esad_lend import imagine
@@ -84,12 +86,30 @@ def test_a_policy_builds_its_critic_and_the_average_of_it(policy_class: str, cri
     assert type(policy.cost_critic) is type(policy.cost_critic_target) is critic_class
 
 
+PARTS = {"gaussian_risk": GaussianCostCritic, "critics_only": CriticsOnlyPenalty, "road_only": RoadOnlyPenalty}
+
+
 @pytest.mark.parametrize("name", VARIANTS)
-def test_variants_can_be_trained_by_name_and_have_their_part(name: str) -> None:
-    parts = {"gaussian_risk": GaussianCostCritic, "critics_only": CriticsOnlyPenalty, "road_only": RoadOnlyPenalty}
+def test_variants_can_be_trained_by_name(name: str) -> None:
     assert ALGORITHMS[name].args[0] is VARIANTS[name]
+
+
+@pytest.mark.parametrize("name", PARTS)
+def test_variants_have_their_part(name: str) -> None:
     model = VARIANTS[name]("CnnPolicy", IMAGES, buffer_size=100)
-    assert parts[name] in {type(model.policy.cost_critic), type(model.penalty)}
+    assert PARTS[name] in {type(model.policy.cost_critic), type(model.penalty)}
+
+
+@pytest.mark.parametrize(("name", "rate"), [("esad_lend", 0.0), ("steady_model", 0.25)])
+def test_the_steady_model_goes_on_learning(name: str, rate: float) -> None:
+    """At the end, where the rate of all others but the cost critics is 0."""
+    algorithm = {"esad_lend": ESADLEND, **VARIANTS}[name]
+    model = algorithm("CnnPolicy", IMAGES, HoldThenFall(start=1.0, hold=0.5), buffer_size=100, min_cost_critic_rate=0.25)
+    model.set_logger(configure(None, []))
+    model._current_progress_remaining = 0.0
+    model._update_learning_rate([network.optimizer for network in (model.policy.world_model, model.policy.actor)])
+    rates = [network.optimizer.param_groups[0]["lr"] for network in (model.policy.world_model, model.policy.actor)]
+    assert rates == [rate, 0.0]
 
 
 def test_the_actor_descends_the_risk_of_a_gaussian() -> None:
