@@ -3,8 +3,8 @@ Do costs come as often as they are dreamed of? ``python benchmark/dreams.py MODE
 
 The model drives unseen episodes with sampled actions. In windows of 16 steps, one after the other, the average of its world
 model starts afresh, sees 6 steps and goes on for 10 without observations, with the actions that were taken: the cost imagined
-for each of them is set against the costs that came; its squared errors are summed over 1,000 steps. An actor that learns from
-dreams fears what they hold (those of its own present actions), not what the road holds.
+for each of them is set against the costs that came; its squared error is in thousandths. An actor that learns from dreams
+fears what they hold (those of its own present actions), not what the road holds.
 """
 
 import argparse
@@ -20,6 +20,7 @@ from diffusion import BATCH, stretches
 from world_model import Step
 
 from sb3_esad import ESADLEND
+from sb3_esad.common.diffusion import DiffusionHead
 from sb3_esad.common.type_aliases import SequenceSamples
 from sb3_esad.common.world_model import WorldModel
 from sb3_esad.envs.intervals import poisson_interval
@@ -103,7 +104,7 @@ def row(name: str, dreams: Dreams, columns: list[int]) -> str:
     :param name: of the row
     :param dreams: costs ahead
     :param columns: which steps
-    :return: a line of the table, with Poisson's 95 % interval of the costs that came, and Brier's score
+    :return: a line of the table, with Poisson's 95 % interval of the costs that came, and 1,000 times the mean squared error
     """
     known = dreams.known[:, columns]
     n, imagined = known.sum(), dreams.imagined[:, columns][known].mean()
@@ -120,7 +121,7 @@ def main() -> None:
     parser.add_argument("--env", default="esad-highway-v0")
     parser.add_argument("--steps", type=int, default=20_000)
     parser.add_argument("--seed", type=int, default=UNSEEN)
-    parser.add_argument("--temperature", type=float, help="of the latents (default: that of the model)")
+    parser.add_argument("--temperature", type=float, help="of a Gaussian prior, in [0, 1] (default: that of the model)")
     args = parser.parse_args()
     if args.steps < (SEEN + AHEAD) * BATCH:
         parser.error(f"--steps is {args.steps}: ask for {(SEEN + AHEAD) * BATCH}, a batch of windows, or more")
@@ -129,11 +130,13 @@ def main() -> None:
     model = ESADLEND.load(args.model)
     env, average = gym.make(args.env), model.policy.world_model_target
     if args.temperature is not None:
+        if not 0 <= args.temperature <= 1 or isinstance(average.rssm.head, DiffusionHead):
+            parser.error(f"--temperature is {args.temperature}: give one in [0, 1], and a model without diffusion")
         average.rssm.head.temperature = args.temperature
     windows = stretches(env, steps(model, env, args.seed), args.steps, SEEN + AHEAD)
     found = [dream(average, samples) for samples in windows]
     dreams = Dreams(*(np.concatenate(field) for field in zip(*found, strict=True)))
-    print("| steps ahead | costs imagined in 1,000 steps | that came | in all | squared errors |\n|---|---|---|---|---|")
+    print("| steps ahead | costs imagined in 1,000 steps | that came | in all | 1000 x squared error |\n|---|---|---|---|---|")
     for step in range(AHEAD):
         print(row(str(step + 1), dreams, [step]))
     print(row("all", dreams, list(range(AHEAD))))

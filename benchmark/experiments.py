@@ -79,8 +79,13 @@ def train(run: Run, steps: int, episodes: int, unseen: int) -> None:
     :param episodes: of each evaluation
     :param unseen: seed of their first
     """
-    if run.curve.exists() and json.loads(run.curve.read_text().splitlines()[-1])["steps"] >= steps:
-        return
+    if run.curve.exists():
+        end = json.loads(run.curve.read_text().splitlines()[-1])
+        known = end.get("unseen", unseen)
+        if known != unseen:
+            sys.exit(f"{run.curve} has episodes from {known}, not from {unseen}: move it away, or give another --out.")
+        if end["steps"] >= steps:
+            return
     script = Path(__file__).with_name("driving.py")
     what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
     how = ["--steps", str(steps), "--every", str(steps // 2), "--episodes", str(episodes), "--threads", "1"]

@@ -100,7 +100,7 @@ class RoadOnly(ESADLEND):
 
 
 class SteadyModel(ESADLEND):
-    """Crawl: the world model, too, goes on learning at the least rate of the cost critics, after a policy that changes."""
+    """Crawl: the rate of the world model, too, does not fall below ``min_cost_critic_rate`` of the first one."""
 
     def _update_learning_rate(self, optimizers: list[th.optim.Optimizer] | th.optim.Optimizer) -> None:
         super()._update_learning_rate(optimizers)

@@ -13,10 +13,12 @@ from typing import Any, cast
 import diffusion
 import dreams
 import driving
+import experiments
 import filtered_driving
 import numpy as np
 import pytest
 import torch as th
+from arms import Arm
 from stable_baselines3 import SAC
 from stable_baselines3.common.logger import configure
 from update_speed import esad_lend
@@ -144,6 +146,14 @@ def test_dreams_are_scored_by_their_squared_error() -> None:
     name, foreseen, came, count, score = dreams.row("2", found, [1]).strip("| ").split(" | ")
     assert (name, foreseen, count, score) == ("2", "200.00", "1", "450.00")
     assert came.startswith("500.00 [")
+
+
+def test_curves_on_other_episodes_are_not_pooled(tmp_path: Path) -> None:
+    run = experiments.Run("esad-braking-v0", "as it is", Arm("esad_lend", {}), 0, tmp_path)
+    run.curve.write_text(json.dumps({"steps": 100, "unseen": 9_000_000}) + "\n")
+    experiments.train(run, 100, 1, 9_000_000)
+    with pytest.raises(SystemExit, match=r"esad_lend_0.jsonl has episodes from 9000000, not from 500000"):
+        experiments.train(run, 100, 1, 500_000)
 
 
 def test_energy_score_of_two_samples() -> None:

@@ -204,3 +204,8 @@ def test_gradients_of_the_diffusion_model_stay_its_own() -> None:
     assert head.denoiser.output.weight.grad.abs().sum() > 0
     assert math.isfinite(logs["diffusion_loss"])
     assert all(parameter.grad is None for parameter in head.posterior_net.parameters())
+
+
+def test_a_refined_sample_has_no_temperature() -> None:
+    with pytest.raises(ValueError, match=r"temperature is 0\.5"):
+        DiffusionHead(SHAPE, 4, 4, 8, temperature=0.5)

@@ -179,6 +179,12 @@ def test_samples_follow_the_distribution_at_a_temperature(temperature: float) ->
     th.testing.assert_close(drawn.std(0), temperature * prior.std, atol=0.05, rtol=0)
 
 
+@pytest.mark.parametrize("temperature", [-0.5, 1.5])
+def test_an_impossible_temperature_is_refused(temperature: float) -> None:
+    with pytest.raises(ValueError, match=f"temperature is {temperature}; choose a factor in"):
+        make_policy(VECTOR, head_kwargs={"temperature": temperature})
+
+
 def test_what_is_observed_has_no_temperature() -> None:
     head = make_policy(VECTOR, head_kwargs={"temperature": 0.0}).world_model.rssm.head
     memory, embedding = th.randn(2, 8, 1, 1), th.randn(2, 8, 1, 1)

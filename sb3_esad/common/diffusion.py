@@ -82,7 +82,7 @@ class DiffusionHead(GaussianHead):
     :param diffusion_steps: K, steps of a sample
     :param start_level: noise that a sample of the prior starts with, in root mean squares of the residual
     :param kwargs: see :class:`GaussianHead`
-    :raises ValueError: if ``diffusion_steps`` or ``start_level`` is out of its range
+    :raises ValueError: if ``diffusion_steps`` or ``start_level`` is out of its range, or ``temperature`` is not 1
     """
 
     residual_scale: th.Tensor
@@ -106,6 +106,7 @@ class DiffusionHead(GaussianHead):
         few = f"a number of steps from 1 to {MOST_STEPS}, or a GaussianHead, which policies have with 0"
         require(1 <= diffusion_steps <= MOST_STEPS, "diffusion_steps", diffusion_steps, few)
         require(start_level > 0, "start_level", start_level, "a multiple > 0")
+        require(self.temperature == 1, "temperature", self.temperature, "1, or a GaussianHead: refined samples have none")
         self.diffusion_steps = diffusion_steps
         self.start_level = start_level
         with th.random.fork_rng(devices=[]):  # so that all other networks begin as they would without a denoiser
