@@ -144,8 +144,8 @@ class GaussianHead(LatentHead):
     :param dynamics_scale: weight of the KL that moves the prior
     :param representation_scale: weight of the KL that moves the posterior
     :param free_nats: divergence below which neither is moved
-    :param temperature: factor of the prior's standard deviation in :meth:`sample`, so in imagination, in [0, 1]; 0 takes the
-        prior's mean. Where training withholds an observation, all of it is drawn (docs/experiments.md, section 32)
+    :param temperature: factor of the prior's standard deviation in :meth:`LatentHead.sample`, so in imagination, in [0, 1]; 0
+        takes the prior's mean. Where training withholds an observation, all of it is drawn (docs/experiments.md, section 32)
     :raises ValueError: if ``temperature`` is out of its range
     """
 
