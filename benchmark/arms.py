@@ -132,7 +132,7 @@ EXPERIMENTS = {
             "steady model": Arm("steady_model", {}, few_updates=False),
             "temperature 0.5": Arm("steady_model", temperature(0.5), few_updates=False),
             "temperature 0": Arm("steady_model", temperature(0.0), few_updates=False),
-            "looks 4 s ahead": Arm("steady_model", {**temperature(0.0), "cost_gamma": 0.95}, few_updates=False),
+            "looks 4 s ahead": Arm("steady_model", {"cost_gamma": 0.95}, few_updates=False),
         },
         steps=15_000,
     ),

@@ -70,6 +70,23 @@ def runs(name: str, envs: Sequence[str], seeds: list[int], out: Path) -> Iterato
                 yield Run(env_id, arm_name, arm, seed, out / name / env_id / arm_name.replace(" ", "_"))
 
 
+def end_of(run: Run, unseen: int) -> dict[str, Any] | None:
+    """
+    Read the last evaluation of a training.
+
+    :param run: which
+    :param unseen: seed of the first episode that it must have been evaluated on, where its curve says on which
+    :return: its line of the curve; None if there is none
+    """
+    if not run.curve.exists():
+        return None
+    end: dict[str, Any] = json.loads(run.curve.read_text().splitlines()[-1])
+    known = end.get("unseen", unseen)
+    if known != unseen:
+        sys.exit(f"{run.curve} has episodes from {known}: give --unseen {known}, or another --out than its own.")
+    return end
+
+
 def train(run: Run, steps: int, episodes: int, unseen: int) -> None:
     """
     Train and evaluate on a thread of its own, unless that has been done.
@@ -79,13 +96,9 @@ def train(run: Run, steps: int, episodes: int, unseen: int) -> None:
     :param episodes: of each evaluation
     :param unseen: seed of their first
     """
-    if run.curve.exists():
-        end = json.loads(run.curve.read_text().splitlines()[-1])
-        known = end.get("unseen", unseen)
-        if known != unseen:
-            sys.exit(f"{run.curve} has episodes from {known}, not from {unseen}: move it away, or give another --out.")
-        if end["steps"] >= steps:
-            return
+    end = end_of(run, unseen)
+    if end is not None and end["steps"] >= steps:
+        return
     script = Path(__file__).with_name("driving.py")
     what = [run.arm.algorithm, "--env", run.env_id, "--seed", str(run.seed), "--set", json.dumps(run.arm.changes)]
     how = ["--steps", str(steps), "--every", str(steps // 2), "--episodes", str(episodes), "--threads", "1"]
@@ -132,19 +145,21 @@ def filtered(ends: list[dict[str, Any]]) -> str:
     return ", ".join(f"{judged:.2f} / {replaced:.2f}" for judged, replaced in rates if judged is not None)
 
 
-def print_table(every: list[Run]) -> None:
+def print_table(every: list[Run], unseen: int) -> None:
     """
     Print what has been found so far.
 
     :param every: trainings of an experiment
+    :param unseen: seed of the first episode of their evaluations
     """
     print("| scenario, arm | best: DS, collision-free %, RC %, m/s | sampled | best: TTC_5 [s] | ", end="")
     print("costs in training | filter at work / replaced | minutes |")
     print("|---|---|---|---|---|---|---|")
     ends: dict[str, list[dict[str, Any]]] = {}
     for run in every:
-        if run.curve.exists():
-            ends.setdefault(f"{run.env_id}, {run.name}", []).append(json.loads(run.curve.read_text().splitlines()[-1]))
+        end = end_of(run, unseen)
+        if end is not None:
+            ends.setdefault(f"{run.env_id}, {run.name}", []).append(end)
     for label, lines in ends.items():
         print(row(label, lines))
 
@@ -168,10 +183,12 @@ def main() -> None:
     experiment = EXPERIMENTS[args.name]
     every = list(runs(args.name, args.envs or experiment.envs, args.seeds, args.out))
     if not args.table:
+        for run in every:
+            end_of(run, args.unseen)  # hours of training must not end with a curve that is refused
         with ThreadPoolExecutor(2) as two:
             list(two.map(lambda run: train(run, args.steps or experiment.steps, args.episodes, args.unseen), every))
     print(f"{args.name}: {experiment.question}\n")
-    print_table(every)
+    print_table(every, args.unseen)
 
 
 if __name__ == "__main__":

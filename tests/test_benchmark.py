@@ -150,10 +150,14 @@ def test_dreams_are_scored_by_their_squared_error() -> None:
 
 def test_curves_on_other_episodes_are_not_pooled(tmp_path: Path) -> None:
     run = experiments.Run("esad-braking-v0", "as it is", Arm("esad_lend", {}), 0, tmp_path)
+    assert experiments.end_of(run, 500_000) is None
     run.curve.write_text(json.dumps({"steps": 100, "unseen": 9_000_000}) + "\n")
     experiments.train(run, 100, 1, 9_000_000)
-    with pytest.raises(SystemExit, match=r"esad_lend_0.jsonl has episodes from 9000000, not from 500000"):
+    refused = r"esad_lend_0\.jsonl has episodes from 9000000: give --unseen 9000000"
+    with pytest.raises(SystemExit, match=refused):
         experiments.train(run, 100, 1, 500_000)
+    with pytest.raises(SystemExit, match=refused):
+        experiments.print_table([run], 500_000)
 
 
 def test_energy_score_of_two_samples() -> None:
